@@ -1,0 +1,45 @@
+"""Errors for which the user's input, not the program, is to blame."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(ValueError):
+    """Say in one line what the user's input lacks and how to mend it."""
+
+
+class DivergedError(RuntimeError):
+    """Say in one line at which step and seed a computation stopped being finite."""
+
+
+def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
+    """Return the known names closest to a misspelt one, closest first.
+
+    Args:
+        name: What the user wrote.
+        known: The names that exist.
+        count: The largest number of names to return.
+
+    Returns:
+        At most `count` names; empty when none is similar.
+    """
+    originals = {candidate.casefold(): candidate for candidate in known}
+    close = difflib.get_close_matches(name.casefold(), originals, n=count, cutoff=0.5)
+    return [originals[match] for match in close]
+
+
+def unknown_name(what: str, name: str, known: Iterable[str]) -> UserError:
+    """Describe an unknown name in one line, with the nearest names or else all of them.
+
+    Args:
+        what: The kind of thing that is named, such as "environment".
+        name: What the user wrote.
+        known: The names that exist.
+    """
+    names = sorted(known)
+    close = nearest(name, names)
+    if close:
+        return UserError(f"unknown {what} {name!r}; did you mean {' or '.join(close)}?")
+    if names:
+        return UserError(f"unknown {what} {name!r}; known: {', '.join(names)}")
+    return UserError(f"unknown {what} {name!r}; there is none to choose from")

@@ -1,0 +1,247 @@
+"""Run directories: what was run, with which versions and seeds, and what came out. No JAX.
+
+A run directory holds `config.json` (format "garat-run/1"), `metrics.jsonl` (one line a logged
+step), and whatever the command adds to it: summaries, checkpoints, plots, `report.html`.
+"""
+
+import dataclasses
+import json
+import math
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from garat_jax.errors import UserError
+from garat_jax.provenance import provenance
+
+FORMAT = "garat-run/1"
+CONFIG = "config.json"
+METRICS = "metrics.jsonl"
+
+
+@dataclasses.dataclass(frozen=True)
+class RunDirectory:
+    """A folder that holds one run.
+
+    Attributes:
+        root: The folder.
+        resumed: Whether the folder held this run before it was opened.
+    """
+
+    root: Path
+    resumed: bool = False
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        config: Any,
+        command: Sequence[str] | str,
+        seeds: Sequence[int],
+        *,
+        force: bool = False,
+        resume: bool = False,
+    ) -> "RunDirectory":
+        """Make a run directory and write its `config.json`, or go on with one that exists.
+
+        Args:
+            path: The folder; its parents are made as needed.
+            config: A dataclass or mapping with the settings that decide the results.
+            command: The command line that started the run.
+            seeds: The seeds of the run.
+            force: Replace the folder if it holds an earlier run.
+            resume: Go on with the run that the folder holds; start one if it is absent or empty.
+
+        Raises:
+            UserError: The folder is not empty and neither `force` nor `resume` was given, it holds
+                something else than a run, or `resume` was given and the run in it has other settings
+                or other seeds.
+        """
+        if force and resume:
+            raise UserError(
+                "--force and --resume exclude each other: one replaces the run, one continues it"
+            )
+        root = Path(path)
+        record = {"config": to_plain(config), "seeds": to_plain(list(seeds))}
+        if _is_occupied(root):
+            if resume:
+                _check_same_run(root, record)
+                return cls(root, resumed=True)
+            if not force:
+                raise UserError(
+                    f"{root} exists already: give --force to replace it, --resume to go on, "
+                    "or another --out"
+                )
+            _remove_run(root)
+        root.mkdir(parents=True, exist_ok=True)
+        run = cls(root)
+        line = command if isinstance(command, str) else " ".join(command)
+        run.write_json(CONFIG, {"format": FORMAT, "command": line, **record, **provenance()})
+        return run
+
+    @classmethod
+    def open(cls, path: str | Path) -> "RunDirectory":
+        """Open the run directory at `path` to read from it.
+
+        Raises:
+            UserError: There is no run in that folder.
+        """
+        root = Path(path)
+        if not is_run(root):
+            raise UserError(f"{root} holds no run: {CONFIG} of format {FORMAT!r} is not there")
+        return cls(root, resumed=True)
+
+    def path(self, name: str) -> Path:
+        """Return the path of a file in the run, and make the folder that it belongs to."""
+        path = self.root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def read_json(self, name: str) -> Any:
+        """Return the content of a JSON file of the run."""
+        return json.loads((self.root / name).read_text(encoding="utf-8"))
+
+    def write_json(self, name: str, value: Any) -> Path:
+        """Write a JSON file whole or not at all.
+
+        Args:
+            name: The file's path inside the run.
+            value: Dataclasses, mappings, sequences, numbers, arrays, paths.
+
+        Returns:
+            The path of the file.
+
+        Raises:
+            ValueError: The value holds a NaN or an infinity.
+        """
+        text = json.dumps(to_plain(value), indent=2, allow_nan=False) + "\n"
+        return _write_whole(self.path(name), text)
+
+    def log(self, step: int, **metrics: Any) -> None:
+        """Append one line to `metrics.jsonl`; numbers that are not finite become null.
+
+        Args:
+            step: The step that the metrics belong to.
+            **metrics: Numbers, or arrays with one number a seed.
+        """
+        line = json.dumps({"step": int(step), **finite_or_null(to_plain(metrics))}, allow_nan=False)
+        with self.path(METRICS).open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+
+    def metrics(self) -> Iterator[dict[str, Any]]:
+        """Yield the logged lines in order; a last line that was cut short is left out."""
+        path = self.root / METRICS
+        if not path.exists():
+            return
+        with path.open(encoding="utf-8") as file:
+            for line in file:
+                if line.endswith("\n"):
+                    yield json.loads(line)
+
+    def rewind(self, step: int) -> None:
+        """Drop the metrics logged after `step`, so that a resumed run repeats none of them."""
+        kept = [line for line in self.metrics() if line["step"] <= step]
+        _write_whole(self.path(METRICS), "".join(json.dumps(line) + "\n" for line in kept))
+
+
+def is_run(path: Path) -> bool:
+    """Tell whether a folder is a run directory."""
+    try:
+        content = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and content.get("format") == FORMAT
+
+
+def to_plain(value: Any) -> Any:
+    """Turn a value into what JSON knows: dicts with string keys, lists, strings, numbers, None.
+
+    Raises:
+        TypeError: The value has no such form.
+    """
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [to_plain(item) for item in value]
+    array = np.asarray(value)
+    if array.dtype == object:
+        raise TypeError(
+            f"{type(value).__name__} has no JSON form; "
+            "expected numbers, strings, arrays, paths, dataclasses or containers of them"
+        )
+    return array.tolist()
+
+
+def finite_or_null(value: Any) -> Any:
+    """Replace each NaN and infinity in a plain value by None."""
+    if isinstance(value, dict):
+        return {key: finite_or_null(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [finite_or_null(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _is_occupied(root: Path) -> bool:
+    if root.exists() and not root.is_dir():
+        raise UserError(f"{root} is a file; expected a folder for the run")
+    return root.is_dir() and any(root.iterdir())
+
+
+def _check_same_run(root: Path, record: Mapping[str, Any]) -> None:
+    if not is_run(root):
+        raise UserError(f"{root} holds no run to resume; give another --out")
+    before = json.loads((root / CONFIG).read_text(encoding="utf-8"))
+    old, new = _leaves(before), _leaves(record)
+    for name in sorted(old.keys() | new.keys()):
+        if old.get(name) != new.get(name):
+            raise UserError(
+                f"{root} was started with {name} = {old.get(name)}, now it is {new.get(name)}: "
+                "resume with the same settings, or start anew with --force"
+            )
+
+
+def _leaves(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Flatten the settings of a record to one entry a setting, named by its path."""
+    flat: dict[str, Any] = {}
+
+    def visit(prefix: str, value: Any) -> None:
+        if isinstance(value, dict) and value:
+            for key, item in value.items():
+                visit(f"{prefix}.{key}", item)
+        else:
+            flat[prefix] = value
+
+    visit("config", record["config"])
+    visit("seeds", record["seeds"])
+    return flat
+
+
+def _remove_run(root: Path) -> None:
+    """Delete an earlier run; anything that is not recognisably one stays."""
+    if not is_run(root) or root.is_symlink():
+        raise UserError(
+            f"{root} is not empty and holds no run, so --force leaves it alone; give another --out"
+        )
+    if Path.cwd().resolve().is_relative_to(root.resolve()):
+        raise UserError(
+            f"{root} is the current folder or holds it, so --force leaves it alone; "
+            "change the folder first"
+        )
+    shutil.rmtree(root)
+
+
+def _write_whole(path: Path, text: str) -> Path:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
+    return path
