@@ -66,17 +66,11 @@ build: setup
 	rm -rf build dist
 	$(BIN)/python -m build --no-isolation
 	$(PYTHON) -m venv build/trial
-	$(MAKE) --no-print-directory trial-install
+	build/trial/bin/python -m pip --disable-pip-version-check install --quiet -c requirements.lock dist/*.whl
 	cd build/trial && bin/python -I -c 'import garat_jax, garat_jax.envs, pathlib; \
 		assets = pathlib.Path(garat_jax.envs.__file__).parent / "assets"; \
 		assert any(assets.glob("*.xml")), f"no MJCF in {assets}"; print(garat_jax.__version__, assets)'
 	cd build/trial && bin/garat --help > /dev/null && bin/garat list
-
-# The clean environment takes its dependencies from the lock, whose fallback it shares with setup.
-.PHONY: trial-install
-trial-install:
-	grep -v '^tfp-nightly' requirements.lock > build/without-nightly.txt
-	build/trial/bin/python -m pip --disable-pip-version-check install --quiet -c build/without-nightly.txt dist/*.whl
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .ruff_cache .import_linter_cache .hypothesis

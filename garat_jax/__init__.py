@@ -14,7 +14,7 @@ _PUBLIC_NAMES: dict[str, str] = {
     "UserError": "garat_jax.errors",
 }
 
-__all__ = ["__version__", *_PUBLIC_NAMES]
+__all__ = ["__version__", *_PUBLIC_NAMES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -53,10 +53,13 @@ def restore(directory: str | Path, like: State, step: int | None = None) -> Stat
     Raises:
         ValueError: There is no such checkpoint, or it is of a state of another structure.
     """
-    step = latest_step(directory) if step is None else step
+    newest = latest_step(directory)
+    if newest is None:
+        raise ValueError(f"no checkpoint in {directory}")
+    step = newest if step is None else step
     with _manager(directory) as manager:
-        if step is None or step not in manager.all_steps():
-            known = ", ".join(map(str, sorted(manager.all_steps()))) or "none"
+        if step not in manager.all_steps():
+            known = ", ".join(map(str, sorted(manager.all_steps())))
             raise ValueError(f"no checkpoint of step {step} in {directory}; it holds: {known}")
         templates = {name: _to_array(leaf) for name, leaf in _named_leaves(like).items()}
         expected = {name: array for name, array in templates.items() if array.size}
@@ -80,7 +83,8 @@ def latest_step(directory: str | Path) -> int | None:
 def _manager(directory: str | Path, keep: int | None = None) -> ocp.CheckpointManager:
     logging.getLogger("absl").setLevel(logging.ERROR)
     options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
-    return ocp.CheckpointManager(Path(directory).resolve(), options=options)
+    handler = ocp.StandardCheckpointHandler()
+    return ocp.CheckpointManager(Path(directory).resolve(), item_handlers=handler, options=options)
 
 
 def _named_leaves(state: Any) -> dict[str, Any]:

@@ -1,7 +1,10 @@
 """Errors for which the user's input, not the program, is to blame."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import TypeVar
+
+Entry = TypeVar("Entry")
 
 
 class UserError(ValueError):
@@ -24,7 +27,7 @@ def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
         At most `count` names; empty when none is similar.
     """
     originals = {candidate.casefold(): candidate for candidate in known}
-    close = difflib.get_close_matches(name.casefold(), originals, n=count, cutoff=0.5)
+    close = difflib.get_close_matches(name.casefold(), originals, n=count, cutoff=0.6)
     return [originals[match] for match in close]
 
 
@@ -43,3 +46,19 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> UserError:
     if names:
         return UserError(f"unknown {what} {name!r}; known: {', '.join(names)}")
     return UserError(f"unknown {what} {name!r}; there is none to choose from")
+
+
+def choose(what: str, name: str, registry: Mapping[str, Entry]) -> Entry:
+    """Return the entry that a name has in a registry.
+
+    Args:
+        what: The kind of thing that is named, such as "environment".
+        name: What the user wrote.
+        registry: The entries by their names.
+
+    Raises:
+        UserError: There is no such name; the message has the nearest ones.
+    """
+    if name not in registry:
+        raise unknown_name(what, name, registry)
+    return registry[name]

@@ -58,8 +58,8 @@ class RunDirectory:
 
         Raises:
             UserError: The folder is not empty and neither `force` nor `resume` was given, it holds
-                something else than a run, or `resume` was given and the run in it has other settings
-                or other seeds.
+                something else than a run, or `resume` was given and the run in it has other
+                settings or seeds.
         """
         if force and resume:
             raise UserError(
@@ -77,7 +77,10 @@ class RunDirectory:
                     "or another --out"
                 )
             _remove_run(root)
-        root.mkdir(parents=True, exist_ok=True)
+        try:
+            root.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"cannot make the folder {root}: {error.strerror}") from error
         run = cls(root)
         line = command if isinstance(command, str) else " ".join(command)
         run.write_json(CONFIG, {"format": FORMAT, "command": line, **record, **provenance()})

@@ -1,0 +1,54 @@
+"""Writes the results of benchmarks, each with what is needed to get them again."""
+
+import datetime
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from garat_jax.provenance import provenance
+from garat_jax.runs import to_plain
+
+FORMAT = "garat-benchmark/1"
+RESULTS = Path(__file__).resolve().parent / "results"
+
+
+def write_result(
+    name: str,
+    rows: Sequence[Mapping[str, Any]],
+    *,
+    seeds: Sequence[int],
+    command: str,
+    folder: Path = RESULTS,
+) -> Path:
+    """Write one benchmark's rows to `results/<name>.json`.
+
+    Args:
+        name: The benchmark; the file is named after it.
+        rows: One mapping a row of the table or a point of the figure.
+        seeds: The seeds that the rows come from.
+        command: The command line that makes the rows again, from the root of the repository.
+        folder: Where the file goes.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        ValueError: There are no rows, or one holds a NaN or an infinity.
+    """
+    if not rows:
+        raise ValueError(f"benchmark {name!r} has no rows; expected one or more")
+    result = {
+        "format": FORMAT,
+        "name": name,
+        "command": command,
+        "seeds": list(seeds),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        **provenance(),
+        "rows": rows,
+    }
+    text = json.dumps(to_plain(result), indent=2, allow_nan=False) + "\n"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.json"
+    path.write_text(text, encoding="utf-8")
+    return path

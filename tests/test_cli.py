@@ -1,0 +1,160 @@
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+
+from garat_jax import cli
+from garat_jax.commandline import parse
+from garat_jax.errors import DivergedError, UserError, nearest, unknown_name
+
+
+def garat(*arguments: str) -> subprocess.CompletedProcess[str]:
+    program = "import sys; from garat_jax.cli import main; sys.exit(main())"
+    return subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=120
+    )
+
+
+def assert_refused(done: subprocess.CompletedProcess[str], *parts: str) -> None:
+    assert done.returncode == 2, done
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("garat: error: ")
+    for part in parts:
+        assert part in line
+
+
+@pytest.mark.parametrize("module", ["garat_jax", "garat_jax.cli", "garat_jax.runs"])
+def test_import_loads_nothing_heavy(module):
+    heavy = ("jax", "mujoco", "brax", "flax", "pandas", "plotly", "scipy", "orbax")
+    program = f"import sys, {module}; print([m for m in {heavy!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "[]\n", done
+
+
+def test_help_names_every_command():
+    done = garat("--help")
+    assert done.returncode == 0
+    assert done.stderr == ""
+    for name in cli.COMMANDS:
+        assert f" {name} " in done.stdout
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_help_of_a_command_explains_every_option(name):
+    done = garat(name, "--help")
+    assert done.returncode == 0
+    for field in dataclasses.fields(cli.COMMANDS[name]):  # pyright: ignore[reportArgumentType]
+        positional = field.name.upper() in done.stdout
+        assert positional or f"--{field.name.replace('_', '-')}" in done.stdout
+
+
+def test_version():
+    done = garat("--version")
+    assert (done.returncode, done.stdout) == (0, "garat 0.1.0\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ([], ["no command", "demo, transfer"]),
+        (["transfr", "x"], ["unknown command 'transfr'", "did you mean transfer?"]),
+        (["qqqq"], ["unknown command 'qqqq'", "known: compare, demo"]),
+        (["--verison"], ["unknown option '--verison'", "--version"]),
+        (["transfer", "x", "--sedes", "2"], ["'--sedes'", "did you mean --seeds"]),
+        (["transfer", "x", "--sedes=2"], ["'--sedes'", "did you mean --seeds"]),
+        (["transfer"], ["Missing", "PAIR"]),
+        (["transfer", "x", "y"], ["Unrecognized", "y"]),
+        (["transfer", "x", "--seeds", "many"], ["--seeds", "'many'"]),
+        (["transfer", "x", "--seeds"], ["Missing value", "--seeds"]),
+        (["transfer", "x", "--seeds", "0"], ["--seeds 0", "1 or more"]),
+        (["transfer", "x", "--engine", "mjxx"], ["'mjxx'", "'auto', 'mjx', 'mujoco'"]),
+        (["compare", "no.xml", "no.csv"], ["MODEL", "there is no file no.xml"]),
+        (["compare", __file__], ["DATA", "one file or more"]),
+        (["compare", __file__, "no.csv"], ["DATA", "there is no file no.csv"]),
+        (["diagnose", __file__, "no.csv"], ["DATA", "there is no file no.csv"]),
+        (["diagnose", __file__, __file__, "--holdout", "no.csv"], ["--holdout", "no file no.csv"]),
+        (["demo", "--measurements", "nowhere"], ["--measurements", "no folder nowhere"]),
+    ],
+)
+def test_a_users_mistake_is_one_line_and_status_2(arguments, parts):
+    assert_refused(garat(*arguments), *parts)
+
+
+@dataclasses.dataclass(frozen=True)
+class Failing:
+    """Fail."""
+
+    how: str = "user"
+    force: bool = False
+    resume: bool = False
+
+    def run(self) -> None:
+        """Fail as asked."""
+        failures = {
+            "user": UserError("expected an apple,\n got a pear"),
+            "interrupt": KeyboardInterrupt(),
+            "diverged": DivergedError("step 3, seed 1: the loss is NaN"),
+        }
+        if self.how == "library":
+            int("pear")
+        raise failures[self.how]
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    monkeypatch.setitem(cli.COMMANDS, "fail", Failing)
+
+
+def test_an_error_is_one_line(failing, capsys):
+    assert cli.main(["fail"]) == 2
+    assert capsys.readouterr().err == "garat: error: expected an apple, got a pear\n"
+
+
+def test_a_fault_of_the_program_keeps_its_traceback(failing):
+    with pytest.raises(ValueError, match="invalid literal"):
+        cli.main(["fail", "--how", "library"])
+
+
+def test_a_plain_value_error_of_the_package_is_a_users_mistake(failing, monkeypatch, capsys):
+    from garat_jax import checkpoint
+
+    monkeypatch.setattr(Failing, "run", lambda self: checkpoint.restore("nowhere", {}))
+    assert cli.main(["fail"]) == 2
+    assert capsys.readouterr().err == "garat: error: no checkpoint in nowhere\n"
+
+
+def test_a_diverged_run_is_one_line_and_status_1(failing, capsys):
+    assert cli.main(["fail", "--how", "diverged"]) == 1
+    assert capsys.readouterr().err == "garat: error: step 3, seed 1: the loss is NaN\n"
+
+
+def test_an_interrupt_says_how_to_go_on(failing, capsys):
+    assert cli.main(["fail", "--how", "interrupt", "--force"]) == 130
+    line = capsys.readouterr().err
+    assert line == "garat: interrupted; go on with: garat fail --how interrupt --resume\n"
+
+
+def test_an_interrupt_of_what_cannot_resume_says_how_to_start_again(monkeypatch, capsys):
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.Diagnose, "run", interrupted)
+    assert cli.main(["diagnose", "my model.xml", "a.csv"]) == 130
+    line = capsys.readouterr().err
+    assert line.endswith("start again with: garat diagnose 'my model.xml' a.csv --force\n")
+
+
+def test_arguments_reach_the_command():
+    command = parse(["transfer", "p", "--seeds", "3", "--resume"], cli.COMMANDS, "")
+    assert command == cli.Transfer("p", seeds=3, resume=True)
+
+
+def test_nearest_is_closest_first_and_ignores_case():
+    assert nearest("Hoper", ["walker2d", "Hopper", "hop"])[0] == "Hopper"
+    assert nearest("xyz", ["walker2d"]) == []
+
+
+def test_unknown_name_without_a_near_one_lists_all():
+    assert "known: a, b" in str(unknown_name("effect", "friction", ["b", "a"]))

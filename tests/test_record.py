@@ -1,0 +1,26 @@
+import json
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.record import write_result
+
+
+def test_a_result_names_what_is_needed_to_get_it_again(tmp_path):
+    rows = [{"env": "x", "rate": np.float32(2.0)}]
+    path = write_result("speed", rows, seeds=range(2), command="python x.py", folder=tmp_path)
+    result = json.loads(path.read_text())
+    assert path == tmp_path / "speed.json"
+    assert result["rows"] == [{"env": "x", "rate": 2.0}]
+    assert result["seeds"] == [0, 1]
+    assert result["command"] == "python x.py"
+    assert {"git", "versions", "machine", "date"} <= result.keys()
+    assert {"cpu", "cores", "memory_gib"} <= result["machine"].keys()
+
+
+@pytest.mark.parametrize("rows", [[], [{"rate": math.nan}]])
+def test_a_result_without_a_value_is_refused(tmp_path, rows):
+    with pytest.raises(ValueError):
+        write_result("speed", rows, seeds=[0], command="python x.py", folder=tmp_path)
+    assert not (tmp_path / "speed.json").exists()
