@@ -1,8 +1,10 @@
 """The set-up: the locked versions, and what `make setup` does on a day when one of them is gone."""
 
+import os
 import re
 import subprocess
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -56,8 +58,6 @@ def test_no_dependency_is_bound_to_an_address():
 
 def test_every_installed_dependency_is_locked():
     """Each distribution that the package needs, directly or not, has its line in the lock."""
-    from importlib import metadata
-
     known, seen = locked(), set()
     todo = [Requirement(line) for line in PROJECT["dependencies"]]
     while todo:
@@ -74,10 +74,13 @@ def test_every_installed_dependency_is_locked():
                 todo.append(child)
 
 
+# What a make that runs these tests would hand down to the make that they run.
+MAKE_VARIABLES = ("MAKEFLAGS", "MAKELEVEL", "MFLAGS", "MAKEOVERRIDES")
+
 FAKE_PYTHON = """#!/bin/sh
 # Stands in for Python: logs what is asked of it, and refuses what FAIL matches.
 echo "$*" >> "{log}"
-if [ "$1 $2" = "-m venv" ]; then mkdir -p "$3/bin" && cp "$0" "$3/bin/python"; exit 0; fi
+if [ "$1 $2" = "-m venv" ]; then mkdir -p "$3/bin" && ln -s "{python}" "$3/bin/python"; exit 0; fi
 case "$*" in {fail}) echo "no matching distribution" >&2; exit 1;; esac
 """
 
@@ -86,15 +89,21 @@ case "$*" in {fail}) echo "no matching distribution" >&2; exit 1;; esac
 def make(tmp_path):
     """Run make in a copy of the set-up whose Python only pretends to install."""
 
+    for name in ("Makefile", "requirements.lock", "pyproject.toml"):
+        (tmp_path / name).write_bytes((REPOSITORY / name).read_bytes())
+    outside = {name: value for name, value in os.environ.items() if name not in MAKE_VARIABLES}
+
     def run(*targets: str, fail: str = "nothing") -> tuple[subprocess.CompletedProcess, list[str]]:
-        for name in ("Makefile", "requirements.lock", "pyproject.toml"):
-            (tmp_path / name).write_bytes((REPOSITORY / name).read_bytes())
         log, python = tmp_path / "log", tmp_path / "python"
         log.write_text("")
-        python.write_text(FAKE_PYTHON.format(log=log, fail=fail))
+        python.write_text(FAKE_PYTHON.format(log=log, python=python, fail=fail))
         python.chmod(0o755)
         done = subprocess.run(
-            ["make", *targets, f"PYTHON={python}"], cwd=tmp_path, capture_output=True, text=True
+            ["make", *targets, f"PYTHON={python}"],
+            cwd=tmp_path,
+            env=outside,
+            capture_output=True,
+            text=True,
         )
         return done, log.read_text().splitlines()
 
@@ -160,7 +169,8 @@ def test_ci_reports_the_status_of_the_checks(tmp_path):
     for status in (0, 1):
         recipe = f"@echo '=== 3 passed in 0.1s ==='; exit {status}"
         (tmp_path / "Makefile").write_text(f"check:\n\t{recipe}\n")
-        done = subprocess.run([script], capture_output=True, text=True, cwd="/")
+        outside = {name: value for name, value in os.environ.items() if name not in MAKE_VARIABLES}
+        done = subprocess.run([script], capture_output=True, text=True, cwd="/", env=outside)
         assert bool(done.returncode) == bool(status)
         assert done.stdout.splitlines()[-1] == "=== 3 passed in 0.1s ==="
         assert done.stderr == ""
