@@ -166,11 +166,12 @@ def test_ci_reports_the_status_of_the_checks(tmp_path):
     script = tmp_path / ".ci" / "run"
     script.write_bytes((REPOSITORY / ".ci" / "run").read_bytes())
     script.chmod(0o755)
-    for status in (0, 1):
-        recipe = f"@echo '=== 3 passed in 0.1s ==='; exit {status}"
-        (tmp_path / "Makefile").write_text(f"check:\n\t{recipe}\n")
+    for lint, status in ((0, 0), (0, 1), (1, 0)):
+        tests = f"@echo '=== 3 passed in 0.1s ==='; exit {status}"
+        rules = f"check: static test\nstatic:\n\t@exit {lint}\ntest:\n\t{tests}\n"
+        (tmp_path / "Makefile").write_text(rules)
         outside = {name: value for name, value in os.environ.items() if name not in MAKE_VARIABLES}
         done = subprocess.run([script], capture_output=True, text=True, cwd="/", env=outside)
-        assert bool(done.returncode) == bool(status)
+        assert bool(done.returncode) == bool(lint or status)
         assert done.stdout.splitlines()[-1] == "=== 3 passed in 0.1s ==="
         assert done.stderr == ""
