@@ -1,0 +1,227 @@
+"""What every physical effect is: parameters with units and bounds, and a law."""
+
+import abc
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import jax
+import mujoco
+import numpy as np
+from flax import struct
+
+from garat_jax.errors import UserError, unknown_name
+
+Named = TypeVar("Named")
+
+
+class Parameter(NamedTuple):
+    """One number of an effect: what it is measured in and what it may be.
+
+    Attributes:
+        name: The field's name.
+        nominal: The value that means "no effect".
+        unit: SI unit at a hinge joint.
+        low: Smallest physically sensible value.
+        high: Largest physically sensible value.
+        scale: A size at which the effect is small but visible; fits start from it.
+        source: Where the bounds come from.
+    """
+
+    name: str
+    nominal: float
+    unit: str
+    low: float
+    high: float
+    scale: float
+    source: str
+
+
+def parameter(
+    nominal: float, *, unit: str, low: float, high: float, scale: float, source: str
+) -> Any:
+    """Declare a parameter as a dataclass field; see `Parameter` for the arguments."""
+    declared = Parameter("", nominal, unit, low, high, scale, source)
+    return dataclasses.field(default=nominal, metadata={"parameter": declared})
+
+
+class ModelView:
+    """Read a model's native fields as the effects applied so far leave them.
+
+    Attributes:
+        host: The compiled MuJoCo model: sizes, names, addresses.
+        changed: Fields that effects replaced, by MuJoCo's name (`opt.` for options).
+    """
+
+    def __init__(
+        self,
+        host: mujoco.MjModel,
+        read: Callable[[str], jax.Array],
+        changed: Mapping[str, jax.Array] | None = None,
+    ):
+        self.host = host
+        self.changed = dict(changed or {})
+        self._read = read
+
+    def __getitem__(self, name: str) -> jax.Array:
+        return self.changed[name] if name in self.changed else self._read(name)
+
+    def replace(self, changed: Mapping[str, jax.Array]) -> "ModelView":
+        """Return a view in which the given fields have new values."""
+        return ModelView(self.host, self._read, {**self.changed, **changed})
+
+    def dofs(self, joint: str) -> np.ndarray:
+        """Return the dof indices of a joint by its name."""
+        index = element_id(self.host, "joint", joint)
+        start = self.host.jnt_dofadr[index]
+        return np.arange(start, start + DOFS_OF_JOINT[self.host.jnt_type[index]])
+
+
+DOFS_OF_JOINT = {
+    int(mujoco.mjtJoint.mjJNT_FREE): 6,
+    int(mujoco.mjtJoint.mjJNT_BALL): 3,
+    int(mujoco.mjtJoint.mjJNT_SLIDE): 1,
+    int(mujoco.mjtJoint.mjJNT_HINGE): 1,
+}
+
+OBJECT_TYPES = {
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+    "joint": mujoco.mjtObj.mjOBJ_JOINT,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+}
+COUNTS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "actuator": "nu"}
+
+
+def element_names(host: mujoco.MjModel, element: str) -> list[str]:
+    """List the names of a model's bodies, joints, geoms or actuators; nameless ones are ''."""
+    kind = OBJECT_TYPES[element]
+    return [mujoco.mj_id2name(host, kind, i) or "" for i in range(getattr(host, COUNTS[element]))]
+
+
+def element_id(host: mujoco.MjModel, element: str, name: str) -> int:
+    """Return an element's index.
+
+    Raises:
+        UserError: The model has no such element; the message names the nearest ones.
+    """
+    names = element_names(host, element)
+    if name not in names:
+        raise unknown_name(element, name, [known for known in names if known])
+    return names.index(name)
+
+
+@struct.dataclass
+class Effect(abc.ABC):
+    """A physical effect at one place of a model.
+
+    A subclass is a `flax.struct.dataclass` whose parameters are pytree leaves, so an effect can be
+    fitted, batched and differentiated. It says what it does in up to three ways:
+    `prepare` changes structure before the model is compiled, `fields` replaces native model
+    fields (both engines), `apply` changes commands and adds forces in every physics substep.
+
+    Attributes:
+        target: Where it acts: `joint/NAME`, `actuator/NAME`, `body/NAME`, `geom/NAME`, `world`,
+            or `all`.
+    """
+
+    kind: ClassVar[str]
+    elements: ClassVar[tuple[str, ...]]
+    law: ClassVar[str]
+    identified_by: ClassVar[str]
+    acts: ClassVar[bool] = False
+    """Whether `apply` does anything; effects that are native fields alone leave it out."""
+    reads_state: ClassVar[bool] = False
+    """Whether `apply` reads the physics state, which costs an engine call per substep."""
+
+    target: str = struct.field(pytree_node=False)
+
+    @property
+    def name(self) -> str:
+        """The target without its kind: `elbow` of `joint/elbow`."""
+        return self.target.partition("/")[2]
+
+    @classmethod
+    def parameters(cls) -> tuple[Parameter, ...]:
+        """Return the declared parameters in order."""
+        return tuple(
+            field.metadata["parameter"]._replace(name=field.name)
+            for field in dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+            if "parameter" in field.metadata
+        )
+
+    @classmethod
+    def targets(cls, host: mujoco.MjModel) -> list[str]:
+        """List every place of a model where this effect can act."""
+        places = []
+        for element in cls.elements:
+            if element in OBJECT_TYPES:
+                names = element_names(host, element)
+                places += [f"{element}/{name}" for name in names if cls.fits(host, element, name)]
+            else:
+                places.append(element)
+        return places
+
+    @classmethod
+    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
+        """Say whether the effect can act on a named element (hinges and slides, real bodies)."""
+        if not name or name == "world":
+            return False
+        if element == "joint":
+            return DOFS_OF_JOINT[host.joint(name).type[0]] == 1
+        return True
+
+    def check(self, host: mujoco.MjModel) -> None:
+        """Check the target against a model.
+
+        Raises:
+            UserError: The target is of the wrong kind, unknown, or cannot carry this effect.
+        """
+        element, _, name = self.target.partition("/")
+        if element not in self.elements:
+            wanted = " or ".join(f"{e}/NAME" if e in OBJECT_TYPES else e for e in self.elements)
+            raise UserError(f"{self.kind} acts on {wanted}, not on {self.target!r}")
+        if element in OBJECT_TYPES:
+            element_id(host, element, name)
+            if not self.fits(host, element, name):
+                raise UserError(f"{self.kind} cannot act on {self.target!r}: not a one-dof joint")
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:  # noqa: B027
+        """Change the model's structure, before it is compiled, so that the law can act."""
+
+    def fields(self, model: ModelView) -> dict[str, jax.Array]:
+        """Return the native model fields that this effect replaces."""
+        del model
+        return {}
+
+    def init(self, host: mujoco.MjModel) -> Any:
+        """Return the memory that `apply` carries from one substep to the next."""
+        del host
+        return ()
+
+    def apply(
+        self, model: ModelView, state: Any, ctrl: jax.Array, memory: Any
+    ) -> tuple[jax.Array, jax.Array | None, Any]:
+        """Act in one physics substep.
+
+        Args:
+            model: The model as all effects leave it.
+            state: The `PhysicsState`; None unless `reads_state`.
+            ctrl: Command, [nu].
+            memory: What `init` or the last substep returned.
+
+        Returns:
+            The command [nu], a generalised force or None [nv], and the new memory.
+        """
+        del model, state
+        return ctrl, None, memory
+
+
+def unit_at(parameter: Parameter, host: mujoco.MjModel, target: str) -> str:
+    """Return a parameter's unit at a target: a slide joint has N and m for N m and rad."""
+    element, _, name = target.partition("/")
+    if element != "joint" or host.joint(name).type[0] != mujoco.mjtJoint.mjJNT_SLIDE:
+        return parameter.unit
+    if parameter.unit == "kg m²":
+        return "kg"
+    return parameter.unit.replace("N m", "N").replace("rad", "m")

@@ -1,0 +1,155 @@
+"""C MuJoCo within compiled programs: a callback that steps a whole batch on threads."""
+
+import functools
+import hashlib
+import threading
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from garat_jax.errors import UserError
+from garat_jax.setconst import CONSTANT_INPUTS
+
+STATE_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")
+INPUTS = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
+
+
+class HostModel:
+    """A compiled MuJoCo model that compares by content, so that equal models share programs.
+
+    Attributes:
+        model: The model. Its automatic reset on bad states is off: a simulation that diverges
+            stays diverged in both engines, and the caller sees it.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.model = model
+        buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, buffer)
+        self._digest = hashlib.sha256(buffer.tobytes()).digest()
+        self._lock = threading.Lock()
+
+    def __hash__(self) -> int:
+        return hash(self._digest)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, HostModel) and self._digest == other._digest
+
+    @functools.cached_property
+    def sizes(self) -> tuple[int, ...]:
+        """Lengths of the state's parts in a row: `STATE_FIELDS`, then sensor data."""
+        m = self.model
+        return (1, m.nq, m.nv, m.na, m.nv, m.nsensordata)
+
+    def advance(self, fields, state, commands, forces, num_substeps: int):
+        """Step one simulation (a batch under `vmap`); see `dynamics.step` for the arguments.
+
+        Args:
+            fields: Native model fields that differ from the compiled model, by name.
+            state: A `PhysicsState`.
+            commands: [substeps, nu], or [1, nu] to hold one command.
+            forces: Generalised forces, shaped alike [.., nv].
+            num_substeps: Physics substeps.
+        """
+        if self.model.nhistory or self.model.nplugin:
+            raise UserError("engine mujoco does not carry plugins or native delays; use mjx")
+        row = jnp.concatenate(
+            [state.time[None], state.qpos, state.qvel, state.act, state.qacc_warmstart]
+        )
+        control = jnp.concatenate([commands, forces], axis=1)
+        inputs = {"row": row, "control": control, **fields}
+        words = row.dtype.itemsize // 4
+        result = jax.pure_callback(
+            functools.partial(self._advance_words, num_substeps, str(row.dtype)),
+            jax.ShapeDtypeStruct((sum(self.sizes) * words,), jnp.uint32),
+            {name: _to_words(value.astype(row.dtype)) for name, value in inputs.items()},
+            vmap_method="expand_dims",
+        )
+        time, *parts = jnp.split(_from_words(result, row.dtype), np.cumsum(self.sizes)[:-1])
+        return type(state)(time[0], *parts, memory=state.memory)
+
+    def _advance_words(self, num_substeps: int, dtype: str, words) -> np.ndarray:
+        fields = {name: np.ascontiguousarray(value).view(dtype) for name, value in words.items()}
+        row, control = fields.pop("row"), fields.pop("control")
+        control = control.reshape(*control.shape[:-1], -1, self.model.nu + self.model.nv)
+        shapes = {name: _field_shape(self.model, name) for name in fields}
+        fields = {name: v.reshape(*v.shape[:-1], *shapes[name]) for name, v in fields.items()}
+        return self._advance_batch(num_substeps, row, control, fields, shapes).view(np.uint32)
+
+    def _advance_batch(self, num_substeps: int, row, control, fields, shapes) -> np.ndarray:
+        leading = np.broadcast_shapes(
+            row.shape[:-1],
+            control.shape[:-2],
+            *(value.shape[: value.ndim - len(shapes[name])] for name, value in fields.items()),
+        )
+        num = int(np.prod(leading, dtype=int))
+        with self._lock:
+            batch = self._batch(num, frozenset(fields))
+            _write_fields(batch, fields, shapes, leading)
+            _write_state(batch, np.broadcast_to(row, leading + row.shape[-1:]), num)
+            controls = np.broadcast_to(control, leading + control.shape[-2:])
+            controls = controls.reshape(num, *control.shape[-2:])
+            if control.shape[-2] == 1:
+                nu = self.model.nu
+                batch.bind("ctrl")[:] = controls[:, 0, :nu]
+                batch.bind("qfrc_applied")[:] = controls[:, 0, nu:]
+                batch.step(nstep=num_substeps)
+            else:
+                batch.rollout(num_substeps, controls, int(INPUTS), record=())
+            parts = [batch.bind(name).reshape(num, -1) for name in (*STATE_FIELDS, "sensordata")]
+            result = np.concatenate(parts, axis=1).astype(row.dtype)
+        return result.reshape(*leading, -1)
+
+    @functools.cached_property
+    def _batches(self) -> dict:
+        return {}
+
+    def _batch(self, num: int, fields: frozenset[str]) -> Batch:
+        """Return the simulations for a batch size; each set of changed fields has its own."""
+        if (num, fields) not in self._batches:
+            batch = Batch(self.model, num)
+            batch.bind("sensordata")
+            self._batches[num, fields] = batch
+        return self._batches[num, fields]
+
+
+def _to_words(values: jax.Array) -> jax.Array:
+    """Flatten floats into 32-bit words: a callback's thread may not have 64-bit types on."""
+    return jax.lax.bitcast_convert_type(values.ravel(), jnp.uint32).ravel()
+
+
+def _from_words(words: jax.Array, dtype) -> jax.Array:
+    if jnp.dtype(dtype).itemsize == 8:
+        words = words.reshape(-1, 2)
+    return jax.lax.bitcast_convert_type(words, dtype)
+
+
+def _field_shape(model: mujoco.MjModel, name: str) -> tuple[int, ...]:
+    owner, _, field = name.rpartition(".")
+    return np.shape(getattr(model.opt if owner else model, field))
+
+
+def _write_fields(batch: Batch, fields, shapes, leading) -> None:
+    """Write per-simulation fields and recompute what derives from those that changed."""
+    stale = False
+    for name, value in fields.items():
+        values = np.broadcast_to(value, leading + shapes[name]).reshape(-1, *shapes[name])
+        held = batch.expand(name)
+        if not np.array_equal(held, values):
+            held[...] = values
+            stale = stale or name in CONSTANT_INPUTS
+    if stale:
+        batch.set_const()
+
+
+def _write_state(batch: Batch, rows: np.ndarray, num: int) -> None:
+    rows = rows.reshape(num, rows.shape[-1])
+    start = 0
+    for name in STATE_FIELDS:
+        view = batch.bind(name).reshape(num, -1)
+        view[...] = rows[:, start : start + view.shape[1]]
+        start += view.shape[1]

@@ -1,0 +1,53 @@
+"""Small models in MJCF that tests share."""
+
+import mujoco
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.002" integrator="Euler"/>
+  <worldbody><body name="pole" pos="0 0 1">
+    <joint name="hinge" axis="0 1 0" damping="0.01"/>
+    <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.6"
+          contype="0" conaffinity="0"/>
+  </body></worldbody>
+  <actuator><motor name="motor" joint="hinge" ctrlrange="-3 3" ctrllimited="true"/></actuator>
+  <sensor><jointpos name="angle" joint="hinge"/></sensor>
+</mujoco>
+"""
+
+ARM = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody><body name="upper" pos="0 0 1">
+    <joint name="shoulder" axis="0 1 0" damping="0.05" limited="true" range="-170 170"/>
+    <geom name="upper_arm" type="capsule" fromto="0 0 0 0.4 0 0" size="0.03" mass="1.2"
+          contype="0" conaffinity="0"/>
+    <body name="forearm" pos="0.4 0 0">
+      <joint name="elbow" axis="0 1 0" damping="0.02" armature="0.01"/>
+      <geom name="lower_arm" type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.7"
+            contype="0" conaffinity="0"/>
+    </body></body></worldbody>
+  <actuator>
+    <position name="shoulder" joint="shoulder" kp="60" kv="2"/>
+    <motor name="elbow" joint="elbow" gear="2"/>
+  </actuator>
+</mujoco>
+"""
+
+TUMBLER = """
+<mujoco>
+  <option timestep="0.002" iterations="50" ls_iterations="50"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1"/>
+    <body name="box" pos="0 0 0.12"><freejoint name="free"/>
+      <geom name="brick" type="box" size="0.1 0.05 0.03" mass="0.4"/>
+      <body name="arm" pos="0.1 0 0"><joint name="ball" type="ball" damping="0.01"/>
+        <geom name="stick" type="capsule" fromto="0 0 0 0.1 0 0" size="0.01" mass="0.1"
+              contype="0" conaffinity="0"/></body></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def spec(mjcf: str) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_string(mjcf)

@@ -1,0 +1,219 @@
+"""The two engines are one physics, and overrides and effects reach both."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from garat_jax import dynamics
+from garat_jax.dynamics import Override
+from garat_jax.effects import CATALOGUE, ActuatorDelay, PayloadMass, RotorInertia, ViscousDamping
+from garat_jax.errors import UserError
+from garat_jax.setconst import set_const
+from tests.models import ARM, PENDULUM, TUMBLER, spec
+
+SIZES = {
+    "viscous_damping": {"coefficient": 0.2},
+    "coulomb_friction": {"torque": 0.3},
+    "torque_offset": {"torque": -0.4},
+    "rotor_inertia": {"inertia": 0.05},
+    "motor_gain": {"scale": 0.7},
+    "actuator_delay": {"delay": 0.013},
+    "payload_mass": {"mass": 0.5, "x": 0.1, "y": 0.02, "z": -0.05},
+    "gravity_scale": {"scale": 0.5},
+}
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def target_of(kind: str, mjcf: str = ARM) -> str:
+    return CATALOGUE[kind].targets(spec(mjcf).compile())[-1]
+
+
+def make(kind: str, nominal: bool = False):
+    cls = CATALOGUE[kind]
+    values = {p.name: p.nominal for p in cls.parameters()} if nominal else SIZES[kind]
+    return cls(target=target_of(kind), **values)
+
+
+def simulate(world: dynamics.Dynamics, num_steps: int = 40, num_substeps: int = 3) -> np.ndarray:
+    """Return qpos and qvel [num_steps, nq + nv] under a fixed command."""
+    host = world.host.model
+    state = dynamics.initial_state(
+        world, jnp.asarray(host.qpos0) + 0.3, jnp.linspace(-0.5, 0.5, host.nv)
+    )
+
+    def control_step(state, t):
+        ctrl = 0.5 * jnp.sin(0.7 * t + jnp.arange(host.nu))
+        state = dynamics.step(world, state, ctrl, num_substeps)
+        return state, jnp.concatenate([state.qpos, state.qvel])
+
+    return np.asarray(
+        jax.jit(lambda s: jax.lax.scan(control_step, s, jnp.arange(num_steps)))(state)[1]
+    )
+
+
+def compiled(mjcf: str, *effects, engine: str, overrides=()):
+    return dynamics.compile(spec(mjcf), overrides, effects, engine)
+
+
+@pytest.mark.parametrize("kind", CATALOGUE)
+def test_both_engines_agree_with_every_effect(kind):
+    effect = make(kind)
+    mjx, c = (simulate(compiled(ARM, effect, engine=e)) for e in ("mjx", "mujoco"))
+    np.testing.assert_allclose(mjx, c, rtol=1e-4, atol=2e-5)
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+@pytest.mark.parametrize("kind", CATALOGUE)
+def test_an_effect_at_its_nominal_is_the_identity_and_elsewhere_is_not(kind, engine):
+    plain = simulate(compiled(ARM, engine=engine), 10)
+    nominal = simulate(compiled(ARM, make(kind, nominal=True), engine=engine), 10)
+    present = simulate(compiled(ARM, make(kind), engine=engine), 10)
+    np.testing.assert_allclose(nominal, plain, atol=1e-6)
+    assert np.abs(present - plain).max() > 1e-3
+
+
+def test_a_loop_in_plain_mujoco_gives_the_same_trajectory():
+    model = spec(PENDULUM).compile()
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = 0.3, -0.5
+    expected = []
+    for t in range(20):
+        data.ctrl[:] = 0.5 * np.sin(0.7 * t)
+        mujoco.mj_step(model, data, 3)
+        expected.append([data.qpos[0], data.qvel[0]])
+    ours = simulate(compiled(PENDULUM, engine="mujoco"), 20)
+    np.testing.assert_allclose(ours, expected, rtol=1e-12)
+
+
+def test_composed_effects_agree_in_both_engines():
+    effects = tuple(make(kind) for kind in ("payload_mass", "actuator_delay", "viscous_damping"))
+    mjx, c = (simulate(compiled(ARM, *effects, engine=e)) for e in ("mjx", "mujoco"))
+    np.testing.assert_allclose(mjx, c, rtol=1e-4, atol=2e-5)
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+def test_vmap_over_states_and_parameters_is_a_loop(engine):
+    world = compiled(PENDULUM, ViscousDamping("joint/hinge", coefficient=0.1), engine=engine)
+    damping = jnp.asarray([0.0, 0.1, 0.5])
+    angles = jnp.asarray([0.1, 0.2])
+
+    def advance(coefficient, angle):
+        changed = world.replace(effects=(world.effects[0].replace(coefficient=coefficient),))
+        state = dynamics.initial_state(changed, angle[None], jnp.ones(1))
+        return dynamics.step(changed, state, jnp.zeros(1), 5).qvel
+
+    batched = jax.vmap(lambda c: jax.vmap(lambda a: advance(c, a))(angles))(damping)
+    looped = jnp.stack([jnp.stack([advance(c, a) for a in angles]) for c in damping])
+    np.testing.assert_allclose(batched, looped, rtol=1e-9)
+    assert batched[0, 0, 0] > batched[2, 0, 0]
+
+
+@pytest.mark.parametrize("mjcf", [ARM, TUMBLER])
+def test_set_const_is_what_mujoco_computes(mjcf):
+    from mujoco import mjx
+
+    model = spec(mjcf).compile()
+    mass = model.body_mass * np.linspace(1.0, 3.0, model.nbody)
+    changed = set_const(mjx.put_model(model).replace(body_mass=jnp.asarray(mass)), model)
+    model.body_mass[:] = mass
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    for name in ("body_subtreemass", "dof_invweight0", "body_invweight0"):
+        np.testing.assert_allclose(getattr(changed, name), getattr(model, name), rtol=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+def test_a_payload_is_the_body_that_the_compiler_makes_of_it(engine):
+    by_hand = spec(ARM)
+    by_hand.body("forearm").add_body(
+        pos=[0.3, 0, 0], ipos=[0, 0, 0], mass=0.5, inertia=[1e-9] * 3, explicitinertial=True
+    )
+    expected = simulate(dynamics.compile(by_hand, engine="mujoco"))
+    effect = PayloadMass("body/forearm", mass=0.5, x=0.3)
+    np.testing.assert_allclose(
+        simulate(compiled(ARM, effect, engine=engine)), expected, rtol=1e-4, atol=2e-5
+    )
+
+
+def test_a_delay_of_whole_control_steps_shifts_the_command():
+    delayed = compiled(PENDULUM, ActuatorDelay("all", delay=0.012), engine="mujoco")
+    state = dynamics.initial_state(delayed, jnp.zeros(1), jnp.zeros(1))
+    states = [state]
+    for command in (1.0, 2.0, 3.0):  # held for 6 ms each
+        states.append(dynamics.step(delayed, states[-1], jnp.asarray([command]), 3))
+    plain = compiled(PENDULUM, engine="mujoco")
+    reference = dynamics.initial_state(plain, jnp.zeros(1), jnp.zeros(1))
+    for command in (1.0, 1.0, 1.0):  # the third command of 3 arrives two steps later
+        reference = dynamics.step(plain, reference, jnp.asarray([command]), 3)
+    np.testing.assert_allclose(states[-1].qpos, reference.qpos, rtol=1e-12)
+
+
+def test_friction_takes_energy_away():
+    decay = [
+        np.abs(simulate(compiled(PENDULUM, make_hinge(kind, size), engine="mujoco"), 200)[-50:, 1])
+        for kind, size in (("viscous_damping", 0.0), ("viscous_damping", 0.1))
+    ]
+    assert decay[1].max() < decay[0].max()
+
+
+def make_hinge(kind: str, size: float):
+    cls = CATALOGUE[kind]
+    return cls("joint/hinge", **{cls.parameters()[0].name: size})
+
+
+def test_armature_override_and_effect_are_the_same_physics():
+    override = compiled(
+        PENDULUM, engine="mujoco", overrides=(Override("joint", "hinge", "armature", 0.2),)
+    )
+    effect = compiled(PENDULUM, RotorInertia("joint/hinge", inertia=0.2), engine="mujoco")
+    np.testing.assert_allclose(simulate(override), simulate(effect), rtol=1e-9)
+
+
+def test_a_mass_override_scales_the_inertia_with_it():
+    before = spec(PENDULUM).compile()
+    after = compiled(PENDULUM, engine="mujoco", overrides=(Override("body", "pole", "mass", 1.8),))
+    np.testing.assert_allclose(after.host.model.body("pole").mass, 1.8)
+    np.testing.assert_allclose(
+        after.host.model.body("pole").inertia, 3 * before.body("pole").inertia
+    )
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (Override("body", "pool", "mass", 1.0), "did you mean pole"),
+        (Override("joint", "hinge", "dampling", 1.0), "did you mean damping"),
+        (Override("body", "pole", "mass", -1.0), "must be positive"),
+        (Override("bodi", "pole", "mass", 1.0), "did you mean body"),
+    ],
+)
+def test_a_wrong_override_is_refused_in_one_line(override, message):
+    with pytest.raises(UserError, match=message) as error:
+        compiled(PENDULUM, engine="mujoco", overrides=(override,))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("effect", "message"),
+    [
+        (ViscousDamping("joint/hing"), "did you mean hinge"),
+        (ViscousDamping("body/pole"), "acts on joint/NAME"),
+        (ViscousDamping("joint/free"), "unknown joint"),
+    ],
+)
+def test_a_misplaced_effect_is_refused(effect, message):
+    with pytest.raises(UserError, match=message):
+        compiled(PENDULUM, effect, engine="mujoco")
+
+
+def test_a_bad_state_stays_bad_in_both_engines():
+    for engine in ("mjx", "mujoco"):
+        world = compiled(PENDULUM, engine=engine)
+        state = dynamics.initial_state(world, jnp.full(1, jnp.nan), jnp.zeros(1))
+        assert np.isnan(dynamics.step(world, state, jnp.zeros(1)).qpos).all()
