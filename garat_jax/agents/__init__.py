@@ -1,0 +1,1 @@
+"""Agents: policy-gradient learners that step an environment and improve a policy."""

@@ -1,0 +1,142 @@
+"""What TRPO and PPO share: their state, their policy, and how they collect a batch."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training.acme import running_statistics, specs
+
+from garat_jax import rollout
+from garat_jax.agents import advantage
+from garat_jax.env import Env, EnvState
+from garat_jax.networks import GaussianPolicy, ValueNet
+from garat_jax.types import Params, Policy, Transition
+
+
+class PolicyParams(NamedTuple):
+    """A policy's weights and the statistics that normalise its observations."""
+
+    weights: Params
+    normaliser: running_statistics.RunningStatisticsState
+
+
+class ActorCriticState(NamedTuple):
+    """Everything that one learner carries from a batch to the next."""
+
+    policy: PolicyParams
+    value: Params
+    optimiser: optax.OptState
+    env: EnvState
+    key: jax.Array
+    env_steps: jax.Array
+
+
+class Batch(NamedTuple):
+    """A batch flattened over time and environments, [N], ready to learn from."""
+
+    obs: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    advantage: jax.Array
+    value_target: jax.Array
+
+
+def init_state(
+    env: Env,
+    env_params: Params,
+    policy: GaussianPolicy,
+    value: ValueNet,
+    key: jax.Array,
+    num_envs: int,
+) -> ActorCriticState:
+    """Initialise networks, statistics and environments; the optimiser is left to the agent."""
+    policy_key, value_key, env_key, key = jax.random.split(key, 4)
+    obs = jnp.zeros(env.obs_size)
+    normaliser = running_statistics.init_state(specs.Array((env.obs_size,), jnp.dtype("float32")))
+    return ActorCriticState(
+        policy=PolicyParams(policy.init(policy_key, obs), normaliser),
+        value=value.init(value_key, obs),
+        optimiser=(),
+        env=rollout.reset(env, env_params, env_key, num_envs),
+        key=key,
+        env_steps=jnp.zeros((), jnp.int32),
+    )
+
+
+def make_policy(network: GaussianPolicy) -> tuple[Policy, Any]:
+    """Return the stochastic policy and its mean action, both on raw observations."""
+
+    def sample(params: PolicyParams, obs: jax.Array, key: jax.Array):
+        distribution = network.apply(params.weights, normalise(params, obs))
+        return distribution.sample_and_log_prob(seed=key)
+
+    def mean(params: PolicyParams, obs: jax.Array) -> jax.Array:
+        return network.apply(params.weights, normalise(params, obs)).loc
+
+    return sample, mean
+
+
+def normalise(params: PolicyParams, obs: jax.Array) -> jax.Array:
+    """Normalise observations [..., obs_size] with the running statistics."""
+    return running_statistics.normalize(obs, params.normaliser, max_abs_value=10.0)
+
+
+def collect(
+    env: Env,
+    env_params: Params,
+    policy: Policy,
+    state: ActorCriticState,
+    length: int,
+) -> tuple[ActorCriticState, Transition]:
+    """Act for `length` steps in every environment with the statistics as they are."""
+    key, unroll_key = jax.random.split(state.key)
+    env_state, transitions = rollout.unroll(
+        env, env_params, policy, state.policy, state.env, unroll_key, length
+    )
+    env_steps = state.env_steps + transitions.reward.size
+    return state._replace(env=env_state, key=key, env_steps=env_steps), transitions
+
+
+def prepare(
+    value: ValueNet,
+    state: ActorCriticState,
+    transitions: Transition,
+    discount: float,
+    trace: float,
+) -> Batch:
+    """Estimate advantages and flatten the batch; observations come out normalised."""
+    obs, next_obs = normalise(state.policy, jnp.stack([transitions.obs, transitions.next_obs]))
+    values = value.apply(state.value, jnp.stack([obs, next_obs]))
+    advantages, targets = advantage.gae(transitions, values[0], values[1], discount, trace)
+    batch = Batch(
+        obs=obs,
+        action=transitions.action,
+        log_prob=transitions.log_prob,
+        advantage=advantage.standardise(advantages),
+        value_target=targets,
+    )
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+
+
+def observe(state: ActorCriticState, transitions: Transition) -> ActorCriticState:
+    """Take a batch's observations into the running statistics, for the next batch."""
+    updated = running_statistics.update(state.policy.normaliser, transitions.obs)
+    return state._replace(policy=state.policy._replace(normaliser=updated))
+
+
+def episode_metrics(transitions: Transition) -> dict[str, jax.Array]:
+    """Return the mean reward a step and the mean steps an episode of a batch."""
+    ended = jnp.sum(transitions.terminated | transitions.truncated)
+    return {
+        "reward": transitions.reward.mean(),
+        "episode_length": transitions.reward.size / jnp.maximum(ended, 1),
+    }
+
+
+def minibatches(batch: Batch, key: jax.Array, num_minibatches: int) -> Batch:
+    """Shuffle a batch [N] and cut it into [num_minibatches, N // num_minibatches]."""
+    total = batch.action.shape[0]
+    size = total // num_minibatches
+    order = jax.random.permutation(key, total)[: size * num_minibatches]
+    return jax.tree.map(lambda x: x[order].reshape(num_minibatches, size, *x.shape[1:]), batch)

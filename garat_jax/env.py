@@ -1,0 +1,162 @@
+"""Environments: a task on dynamics that are an explicit argument of every call."""
+
+import abc
+import dataclasses
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from garat_jax import dynamics
+from garat_jax.dynamics import Dynamics, PhysicsState
+from garat_jax.types import Params
+
+
+class EnvState(NamedTuple):
+    """One environment between two steps.
+
+    Attributes:
+        physics: The physics.
+        obs: What the policy sees, [obs_size].
+        steps: Control steps since the reset, [].
+    """
+
+    physics: PhysicsState
+    obs: jax.Array
+    steps: jax.Array
+
+
+class StepResult(NamedTuple):
+    """What a step gave; `state` is never reset, so its `obs` is the true next observation."""
+
+    state: EnvState
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+
+
+class Task(abc.ABC):
+    """What an agent is asked to do with a model; stateless and without parameters.
+
+    Attributes:
+        mjcf: The model.
+        num_substeps: Physics substeps in a control step.
+        episode_length: Control steps after which an episode is truncated.
+        solved_return: Mean return from which the task counts as solved.
+    """
+
+    mjcf: Path
+    num_substeps: int
+    episode_length: int
+    solved_return: float
+
+    @abc.abstractmethod
+    def initial(self, host: mujoco.MjModel, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draw an initial qpos [nq] and qvel [nv]."""
+
+    @abc.abstractmethod
+    def observe(self, state: PhysicsState) -> jax.Array:
+        """Return the observation [obs_size]."""
+
+    @abc.abstractmethod
+    def reward(self, before: PhysicsState, action: jax.Array, after: PhysicsState) -> jax.Array:
+        """Return the reward [] of a control step."""
+
+    @abc.abstractmethod
+    def terminated(self, after: PhysicsState) -> jax.Array:
+        """Say whether the episode is over for good, []."""
+
+
+class Env(abc.ABC):
+    """One environment; batch it with `jax.vmap`.
+
+    Attributes:
+        obs_size: Length of an observation.
+        action_low: Lower bounds, [action_size].
+        action_high: Upper bounds, [action_size].
+        episode_length: Control steps until truncation.
+    """
+
+    obs_size: int
+    action_low: np.ndarray
+    action_high: np.ndarray
+    episode_length: int
+
+    @property
+    def action_size(self) -> int:
+        """Number of actions."""
+        return self.action_low.shape[0]
+
+    def clip(self, action: jax.Array) -> jax.Array:
+        """Return the action [action_size] within its bounds."""
+        return jnp.clip(action, self.action_low, self.action_high)
+
+    @abc.abstractmethod
+    def reset(self, params: Params, key: jax.Array) -> EnvState:
+        """Start an episode."""
+
+    @abc.abstractmethod
+    def step(
+        self, params: Params, state: EnvState, action: jax.Array, key: jax.Array
+    ) -> StepResult:
+        """Take one control step with an action [action_size], which is clipped."""
+
+
+class TaskEnv(Env):
+    """A task on physics: the world that agents act in; `params` are its `Dynamics`."""
+
+    def __init__(self, task: Task, world: Dynamics):
+        host = world.host.model
+        limited = host.actuator_ctrllimited.astype(bool)
+        self.task = task
+        self.episode_length = task.episode_length
+        self.action_low = np.where(limited, host.actuator_ctrlrange[:, 0], -np.inf)
+        self.action_high = np.where(limited, host.actuator_ctrlrange[:, 1], np.inf)
+        shape = jax.eval_shape(self.reset, world, jax.random.key(0))
+        self.obs_size = shape.obs.shape[0]
+
+    def reset(self, params: Dynamics, key: jax.Array) -> EnvState:
+        """Start an episode at a state drawn by the task."""
+        qpos, qvel = self.task.initial(params.host.model, key)
+        physics = dynamics.initial_state(params, qpos, qvel)
+        return EnvState(physics, self.task.observe(physics), jnp.zeros((), jnp.int32))
+
+    def step(
+        self, params: Dynamics, state: EnvState, action: jax.Array, key: jax.Array
+    ) -> StepResult:
+        """Hold the clipped action as the command for one control step."""
+        del key
+        action = self.clip(action)
+        physics = dynamics.step(params, state.physics, action, self.task.num_substeps)
+        reward = self.task.reward(state.physics, action, physics)
+        terminated = self.task.terminated(physics)
+        steps = state.steps + 1
+        truncated = (steps >= self.episode_length) & ~terminated
+        after = EnvState(physics, self.task.observe(physics), steps)
+        return StepResult(after, reward, terminated, truncated)
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """An environment together with the dynamics that make it this world."""
+
+    env: TaskEnv
+    params: Dynamics
+
+
+def make_world(
+    task: Task,
+    overrides: tuple[dynamics.Override, ...] = (),
+    effects: tuple[Any, ...] = (),
+    engine: str = "auto",
+) -> World:
+    """Compile a task's model with overrides and effects.
+
+    Raises:
+        UserError: As `dynamics.compile`.
+    """
+    params = dynamics.compile(dynamics.load_spec(task.mjcf), overrides, effects, engine)
+    return World(TaskEnv(task, params), params)

@@ -1,0 +1,1 @@
+"""Methods that ground a simulator: they change its actions until it moves like the target."""
