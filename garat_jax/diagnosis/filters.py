@@ -1,0 +1,80 @@
+"""Derivatives and noise of sampled signals; sampling may be irregular."""
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+WINDOW = 0.05
+"""Seconds over which a derivative is taken: short against a robot joint's motion."""
+FEWEST = 5
+"""Samples in that window at least."""
+ORDERS = (2, 4)
+"""Orders of the differences that tell noise from motion."""
+
+
+def local_slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Differentiate by local polynomials (Savitzky and Golay 1964, for irregular sampling too).
+
+    A quadratic is fitted, with tricube weights, to the samples around each one: about `WINDOW`
+    seconds and at least `FEWEST` samples, the nearest full window at either end.
+
+    Args:
+        time: Seconds, increasing, [T] with T >= `FEWEST`.
+        values: [T, N].
+
+    Returns:
+        Derivatives, [T, N].
+    """
+    num = len(time)
+    half = max(FEWEST // 2, round(0.5 * WINDOW / float(np.median(np.diff(time)))))
+    width = min(2 * half + 1, num)
+    first = np.clip(np.arange(num) - half, 0, num - width)
+    index = first[:, None] + np.arange(width)
+    offset = time[index] - time[:, None]
+    reach = np.abs(offset).max(axis=1, keepdims=True)
+    offset = offset / reach
+    weight = (1 - np.minimum(np.abs(offset) * width / (width + 1), 1) ** 3) ** 3
+    powers = np.stack([np.ones_like(offset), offset, offset**2], axis=2)
+    weighted = powers * weight[..., None]
+    normal = np.einsum("tki,tkj->tij", weighted, powers)
+    moments = np.einsum("tki,tkn->tin", weighted, values[index])
+    return np.linalg.solve(normal, moments)[:, 1] / reach
+
+
+def white_noise(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Estimate the standard deviation of white noise on slow signals.
+
+    Differences of second and of fourth order, scaled so that white noise passes with its own
+    standard deviation, hold little of the motion; their median absolute value is robust to the
+    moments at which they do. The smaller of the two orders counts: what motion adds only
+    makes an estimate larger. Encoder steps are a floor: a step over the square root of 12.
+
+    Args:
+        time: Seconds, increasing, [T] with T > 4.
+        values: [T, N].
+
+    Returns:
+        Standard deviations, [N].
+    """
+    estimates = []
+    for order in ORDERS:
+        times = sliding_window_view(time, order + 1)
+        gaps = times[:, :, None] - times[:, None, :] + np.eye(order + 1)
+        weights = 1.0 / np.prod(gaps / (times[:, -1] - times[:, 0])[:, None, None], axis=2)
+        weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+        windows = sliding_window_view(values, order + 1, axis=0)
+        differences = np.einsum("tk,tnk->tn", weights, windows)
+        estimates.append(1.4826 * np.median(np.abs(differences), axis=0))
+    steps = np.asarray([quantum(column) for column in values.T])
+    return np.maximum(np.min(estimates, axis=0), steps / np.sqrt(12.0))
+
+
+def quantum(values: np.ndarray) -> float:
+    """Return the step of a quantised signal [T], 0 where the values lie on no coarse grid."""
+    levels = np.unique(values)
+    if len(levels) < 3 or len(levels) > 0.5 * len(values):
+        return 0.0
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-6 * float(np.median(steps))]
+    step = float(steps.min())
+    ratio = steps / step
+    return step if np.all(np.abs(ratio - np.round(ratio)) < 0.05 * ratio) else 0.0

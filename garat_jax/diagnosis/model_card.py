@@ -1,0 +1,191 @@
+"""Models to diagnose: an MJCF file, or a card that adds overrides and effects to one.
+
+A card (TOML, format "garat-model/1") names an MJCF file in its own folder, `[[override]]` tables
+with `element name field value`, and `[[effect]]` tables with `kind target parameters`.
+"""
+
+import dataclasses
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from garat_jax.dynamics import Dynamics, Override, compile, load_spec
+from garat_jax.effects import CATALOGUE, Effect
+from garat_jax.errors import UserError, choose, unknown_name
+
+FORMAT = "garat-model/1"
+CARD_KEYS = ("format", "mjcf", "override", "effect")
+OVERRIDE_KEYS = ("element", "name", "field", "value")
+EFFECT_KEYS = ("kind", "target", "parameters")
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A model with overrides and effects.
+
+    Attributes:
+        name: The file's name without its ending.
+        path: The file that was read: MJCF or card.
+        mjcf: The MJCF file.
+        spec: MuJoCo's editable model.
+        overrides: Changes of the model before it is compiled.
+        effects: Physical effects added to it.
+    """
+
+    name: str
+    path: Path
+    mjcf: Path
+    spec: mujoco.MjSpec
+    overrides: tuple[Override, ...] = ()
+    effects: tuple[Effect, ...] = ()
+
+    def compile(self, engine: str = "auto", extra_effects: Sequence[Effect] = ()) -> Dynamics:
+        """Compile the model, with more effects after its own; see `dynamics.compile`."""
+        return compile(self.spec, self.overrides, (*self.effects, *extra_effects), engine)
+
+
+def load_model(path: str | Path) -> Model:
+    """Read an MJCF file (.xml) or a model card (.toml).
+
+    Raises:
+        UserError: The file cannot be read, or the card names something that does not exist.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".xml":
+        return Model(path.stem, path, path, load_spec(path))
+    if path.suffix.lower() != ".toml":
+        raise UserError(f"{path}: expected an MJCF file (.xml) or a model card (.toml)")
+    card = _read_toml(path)
+    mjcf = _mjcf_of(path, card)
+    spec = load_spec(mjcf)
+    try:
+        overrides = tuple(_override(table) for table in _tables(card, "override"))
+        effects = tuple(_effect(table) for table in _tables(card, "effect"))
+        host = compile(spec, overrides, engine="mujoco").host.model
+        for effect in effects:
+            effect.check(host)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    return Model(path.stem, path, mjcf, spec, overrides, effects)
+
+
+def save_card(path: str | Path, model: Model, extra_effects: Sequence[Effect] = ()) -> Path:
+    """Write a model, with more effects, as a card.
+
+    Args:
+        path: The card; the model's MJCF has to lie in its folder or below.
+        model: The model.
+        extra_effects: Effects to add after the model's own.
+
+    Returns:
+        The path of the card.
+
+    Raises:
+        UserError: The card would lie outside the folder of the model's MJCF, or is no .toml file.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".toml":
+        raise UserError(f"{path}: a model card's name ends in .toml")
+    folder, mjcf = path.parent.resolve(), model.mjcf.resolve()
+    if not mjcf.is_relative_to(folder):
+        raise UserError(
+            f"{path}: a card may not leave its folder, and {model.mjcf} is not in it; "
+            f"write the card to {model.mjcf.parent} or copy the model first"
+        )
+    lines = [f"format = {_toml(FORMAT)}", f"mjcf = {_toml(mjcf.relative_to(folder).as_posix())}"]
+    for override in model.overrides:
+        lines += ["", "[[override]]"]
+        lines += [f"{key} = {_toml(getattr(override, key))}" for key in OVERRIDE_KEYS]
+    for effect in (*model.effects, *extra_effects):
+        values = (f"{p.name} = {_toml(getattr(effect, p.name))}" for p in effect.parameters())
+        lines += ["", "[[effect]]", f"kind = {_toml(effect.kind)}"]
+        lines += [f"target = {_toml(effect.target)}", f"parameters = {{ {', '.join(values)} }}"]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        card = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}") from error
+    except ValueError as error:
+        raise UserError(f"{path}: no valid TOML: {error}") from error
+    if card.get("format") != FORMAT:
+        raise UserError(f"{path}: format is {card.get('format')!r}; expected {FORMAT!r}")
+    for key in card:
+        if key not in CARD_KEYS:
+            raise UserError(f"{path}: {unknown_name('key', key, CARD_KEYS)}")
+    return card
+
+
+def _mjcf_of(path: Path, card: Mapping[str, Any]) -> Path:
+    name = card.get("mjcf")
+    if not isinstance(name, str) or not name:
+        raise UserError(
+            f'{path}: mjcf is missing; expected mjcf = "FILE.xml", relative to the card'
+        )
+    mjcf = path.parent / name
+    if Path(name).is_absolute() or not mjcf.resolve().is_relative_to(path.parent.resolve()):
+        raise UserError(
+            f"{path}: mjcf = {name!r} leaves the card's folder; put the model beside it"
+        )
+    return mjcf
+
+
+def _tables(card: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
+    tables = card.get(key, [])
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise UserError(f"{key} is no list of tables; write each as [[{key}]]")
+    return tables
+
+
+def _check_keys(table: Mapping[str, Any], what: str, keys: tuple[str, ...]) -> None:
+    for key in table:
+        if key not in keys:
+            raise unknown_name(f"key of an {what}", key, keys)
+    for key in keys:
+        if key not in table:
+            raise UserError(f"[[{what}]] lacks {key}; expected {', '.join(keys)}")
+
+
+def _override(table: dict[str, Any]) -> Override:
+    # The options of a model have no name.
+    table = {"name": "", **table} if table.get("element") == "option" else table
+    _check_keys(table, "override", OVERRIDE_KEYS)
+    for key in ("element", "name", "field"):
+        if not isinstance(table[key], str):
+            raise UserError(f"[[override]] {key} = {table[key]!r}; expected a name")
+    return Override(**table)
+
+
+def _effect(table: dict[str, Any]) -> Effect:
+    _check_keys(table, "effect", EFFECT_KEYS)
+    kind, target, parameters = (table[key] for key in EFFECT_KEYS)
+    if not isinstance(kind, str) or not isinstance(target, str) or not isinstance(parameters, dict):
+        raise UserError("[[effect]] needs names for kind and target and a table of parameters")
+    cls = choose("effect", kind, CATALOGUE)
+    known = [parameter.name for parameter in cls.parameters()]
+    for name, value in parameters.items():
+        if name not in known:
+            raise unknown_name(f"parameter of {kind}", name, known)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise UserError(f"{kind} {name} = {value!r}; expected a finite number")
+    return cls(target=target, **{name: float(value) for name, value in parameters.items()})
+
+
+def _toml(value: Any) -> str:
+    """Write a string, truth value, number or list of these as TOML."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        return str(value)
+    array = np.asarray(value, float)
+    return "[" + ", ".join(map(_toml, array)) + "]" if array.ndim else repr(float(array))

@@ -1,0 +1,160 @@
+"""Read a file of columns: CSV, Parquet or NPZ, as arrays of numbers. Nothing is ever unpickled."""
+
+import csv
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from garat_jax.errors import UserError
+
+ROWS_NAMED = 5
+"""How many bad rows a message names."""
+
+
+class Table:
+    """Named columns of equal length from one file.
+
+    Attributes:
+        path: The file.
+        columns: Arrays [T] float64, by name.
+    """
+
+    def __init__(self, path: Path, columns: dict[str, np.ndarray]):
+        """Check that there are columns and that they are of equal length."""
+        self.path = path
+        self.columns = columns
+        lengths = {name: len(column) for name, column in columns.items()}
+        if not lengths:
+            raise UserError(f"{path}: no columns; expected time, qpos.JOINT, ctrl.ACTUATOR")
+        if len(set(lengths.values())) > 1:
+            short, long = (
+                min(lengths, key=lengths.__getitem__),
+                max(lengths, key=lengths.__getitem__),
+            )
+            raise UserError(
+                f"{path}: array {short!r} has {lengths[short]} samples and {long!r} has "
+                f"{lengths[long]}; expected one value a sample in each"
+            )
+
+    def rows(self, bad: np.ndarray) -> str:
+        """Name the rows at which a mask [T] is true: lines of a CSV file, else rows from 0."""
+        indices = np.flatnonzero(bad)
+        word, first = ("line", 2) if self.path.suffix.lower() == ".csv" else ("row", 0)
+        named = ", ".join(str(i + first) for i in indices[:ROWS_NAMED])
+        more = f" and {len(indices) - ROWS_NAMED} more" if len(indices) > ROWS_NAMED else ""
+        return f"{word}{'s' if len(indices) > 1 else ''} {named}{more}"
+
+
+def read_table(path: str | Path) -> Table:
+    """Read the columns of a CSV, Parquet or NPZ file.
+
+    Raises:
+        UserError: The file is missing, empty, of another kind, damaged, or holds anything but
+            numbers.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    if path.stat().st_size == 0:
+        raise UserError(f"{path}: the file is empty; expected a recording")
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise UserError(
+            f"{path}: unknown kind of file {path.suffix!r}; expected {', '.join(_READERS)}"
+        )
+    try:
+        return Table(path, reader(path))
+    except UserError:
+        raise
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        detail = " ".join(str(error).split()) or type(error).__name__
+        raise UserError(f"{path}: cannot be read as {path.suffix[1:].upper()}: {detail}") from error
+
+
+def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        header = [name.strip() for name in next(csv.reader(file), [])]
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        mark = ";" if ";" in header[0] else "a tab"
+        raise UserError(f"{path}: columns are separated by {mark}; expected commas")
+    if all(_is_number(name) for name in header):
+        raise UserError(
+            f"{path}: line 1 holds numbers; expected the columns' names, such as time,qpos.JOINT"
+        )
+    twice = [name for name in header if header.count(name) > 1]
+    if twice:
+        raise UserError(f"{path}: column {twice[0]!r} is there {header.count(twice[0])} times")
+    frame = pd.read_csv(
+        path,
+        header=None,
+        names=header,
+        index_col=False,
+        skiprows=1,
+        skip_blank_lines=False,
+        encoding="utf-8-sig",
+        on_bad_lines="error",
+        low_memory=False,
+    )
+    filled = np.flatnonzero(frame.notna().any(axis=1))
+    return _numbers(path, frame.iloc[: filled[-1] + 1 if len(filled) else 0])
+
+
+def _read_parquet(path: Path) -> dict[str, np.ndarray]:
+    return _numbers(path, pd.read_parquet(path))
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    if not zipfile.is_zipfile(path):
+        raise UserError(f"{path}: not an NPZ archive; write it with numpy.savez")
+    columns = {}
+    with np.load(path, allow_pickle=False) as archive:
+        for name in archive.files:
+            try:
+                values = archive[name]
+            except ValueError as error:
+                raise UserError(
+                    f"{path}: array {name!r} holds pickled Python objects, which are never loaded; "
+                    "save it as plain numbers"
+                ) from error
+            if values.ndim != 1 or values.dtype.kind not in "fiu":
+                raise UserError(
+                    f"{path}: array {name!r} has shape {values.shape} and type {values.dtype}; "
+                    "expected one number a sample"
+                )
+            columns[name] = values.astype(float)
+    return columns
+
+
+_READERS = {".csv": _read_csv, ".parquet": _read_parquet, ".npz": _read_npz}
+
+
+def _numbers(path: Path, frame: pd.DataFrame) -> dict[str, np.ndarray]:
+    """Return a frame's columns as numbers.
+
+    Raises:
+        UserError: A field holds something else; the message says where.
+    """
+    columns = {}
+    for name in map(str, frame.columns):
+        values = frame[name]
+        if pd.api.types.is_numeric_dtype(values) and not pd.api.types.is_bool_dtype(values):
+            columns[name] = values.to_numpy(dtype=float, na_value=np.nan)
+            continue
+        numbers = pd.to_numeric(values.astype(str), errors="coerce").to_numpy(float)
+        bad = np.isnan(numbers) & values.notna().to_numpy()
+        if not bad.any():
+            bad = values.notna().to_numpy()
+        where = Table(path, {name: numbers}).rows(bad)
+        first = str(values.iloc[int(np.flatnonzero(bad)[0])])
+        raise UserError(f"{path}: {name} holds {first!r} at {where}; expected numbers")
+    return columns
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
