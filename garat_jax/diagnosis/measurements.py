@@ -23,8 +23,8 @@ FEWEST_SAMPLES = 20
 """Samples that a recording must have, and each part of it between gaps."""
 GAP = 5.0
 """A step longer than this many median steps is a gap."""
-LARGEST_ANGLE = 4 * np.pi
-"""Radians beyond which an angle may well be in degrees."""
+LARGEST_ANGLE = 50.0
+"""Radians, eight turns, beyond which an angle may well be in degrees."""
 SLACK = 0.5
 """Radians by which a measured angle may leave the joint's range without a word."""
 

@@ -140,9 +140,9 @@ def _numbers(path: Path, frame: pd.DataFrame) -> dict[str, np.ndarray]:
     for name in map(str, frame.columns):
         values = frame[name]
         if pd.api.types.is_numeric_dtype(values) and not pd.api.types.is_bool_dtype(values):
-            columns[name] = values.to_numpy(dtype=float, na_value=np.nan)
+            columns[name] = np.asarray(values.astype("float64"))
             continue
-        numbers = pd.to_numeric(values.astype(str), errors="coerce").to_numpy(float)
+        numbers = np.asarray(pd.to_numeric(values.astype(str), errors="coerce"), float)
         bad = np.isnan(numbers) & values.notna().to_numpy()
         if not bad.any():
             bad = values.notna().to_numpy()
