@@ -46,7 +46,8 @@ def white_noise(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     Differences of second and of fourth order, scaled so that white noise passes with its own
     standard deviation, hold little of the motion; their median absolute value is robust to the
     moments at which they do. The smaller of the two orders counts: what motion adds only
-    makes an estimate larger. Encoder steps are a floor: a step over the square root of 12.
+    makes an estimate larger. Below an encoder's step the median means nothing: there the root mean
+    square counts, and at least the step over the square root of 12.
 
     Args:
         time: Seconds, increasing, [T] with T > 4.
@@ -55,17 +56,19 @@ def white_noise(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     Returns:
         Standard deviations, [N].
     """
-    estimates = []
+    steps = np.asarray([quantum(column) for column in values.T])
+    by_median, by_square = [], []
     for order in ORDERS:
         times = sliding_window_view(time, order + 1)
         gaps = times[:, :, None] - times[:, None, :] + np.eye(order + 1)
         weights = 1.0 / np.prod(gaps / (times[:, -1] - times[:, 0])[:, None, None], axis=2)
         weights /= np.linalg.norm(weights, axis=1, keepdims=True)
         windows = sliding_window_view(values, order + 1, axis=0)
-        differences = np.einsum("tk,tnk->tn", weights, windows)
-        estimates.append(1.4826 * np.median(np.abs(differences), axis=0))
-    steps = np.asarray([quantum(column) for column in values.T])
-    return np.maximum(np.min(estimates, axis=0), steps / np.sqrt(12.0))
+        differences = np.abs(np.einsum("tk,tnk->tn", weights, windows))
+        by_median.append(1.4826 * np.median(differences, axis=0))
+        by_square.append(np.sqrt(np.mean(np.minimum(differences, 3 * steps) ** 2, axis=0)))
+    median, square = np.min(by_median, axis=0), np.min(by_square, axis=0)
+    return np.where(median < steps, np.maximum(square, steps / np.sqrt(12.0)), median)
 
 
 def quantum(values: np.ndarray) -> float:

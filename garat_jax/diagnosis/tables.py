@@ -76,8 +76,8 @@ def read_table(path: str | Path) -> Table:
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
     with path.open(newline="", encoding="utf-8-sig") as file:
         header = [name.strip() for name in next(csv.reader(file), [])]
-    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        mark = ";" if ";" in header[0] else "a tab"
+    if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
+        mark = "';'" if ";" in header[0] else "tabs"
         raise UserError(f"{path}: columns are separated by {mark}; expected commas")
     if all(_is_number(name) for name in header):
         raise UserError(
@@ -139,6 +139,9 @@ def _numbers(path: Path, frame: pd.DataFrame) -> dict[str, np.ndarray]:
     columns = {}
     for name in map(str, frame.columns):
         values = frame[name]
+        if values.isna().all():
+            columns[name] = np.full(len(values), np.nan)
+            continue
         if pd.api.types.is_numeric_dtype(values) and not pd.api.types.is_bool_dtype(values):
             columns[name] = np.asarray(values.astype("float64"))
             continue
