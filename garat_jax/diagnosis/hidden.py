@@ -1,0 +1,210 @@
+"""Make "measurements" that hide one physical effect, with C MuJoCo alone.
+
+Nothing here uses the catalogue's laws or the engine: effects are native fields of MuJoCo, forces
+and late commands in a plain `mj_step` loop at a finer timestep than the model's.
+"""
+
+import csv
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+REFINEMENT = 32
+"""Physics substeps in one timestep of the model under diagnosis."""
+ANGLE_NOISE, SPEED_NOISE = 1e-3, 1e-2
+"""Standard deviation of the sensors' white noise, rad and rad/s."""
+SIZE_RANGE = (0.7, 1.4)
+"""A hidden effect has its typical size times a factor drawn from here."""
+
+
+class Hidden(NamedTuple):
+    """What was recorded, and the truth.
+
+    Attributes:
+        fit: Recordings to find the effect with.
+        holdout: Recordings to prove it on.
+        kind: The catalogue's name of the effect; "none" or a name outside the catalogue too.
+        target: Where it acts; empty for none.
+        parameters: Its true parameters.
+    """
+
+    fit: tuple[Path, ...]
+    holdout: tuple[Path, ...]
+    kind: str
+    target: str
+    parameters: Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Secret:
+    """How an effect enters the truth.
+
+    Attributes:
+        element: What it acts on: `joint`, `actuator`, `body`, `world`, or "" for nothing.
+        parameters: Typical size of each parameter; "no effect" plus a change that is scaled.
+        change: Changes the spec before it is compiled.
+        force: Generalised force on the first joint at (time [s], speed [rad/s]), N m.
+        late: Seconds by which commands are late.
+        gain: Factor on the command at a time [s].
+    """
+
+    element: str
+    parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    change: Callable[[mujoco.MjSpec, Mapping[str, float]], None] = lambda spec, p: None
+    force: Callable[[float, float, Mapping[str, float]], float] = lambda t, v, p: 0.0
+    late: Callable[[Mapping[str, float]], float] = lambda p: 0.0
+    gain: Callable[[float, Mapping[str, float]], float] = lambda t, p: 1.0
+
+
+def _add_damping(spec: mujoco.MjSpec, p: Mapping[str, float]) -> None:
+    spec.joints[0].damping[0] += p["coefficient"]
+
+
+def _add_friction(spec: mujoco.MjSpec, p: Mapping[str, float]) -> None:
+    spec.joints[0].frictionloss += p["torque"]
+
+
+def _add_armature(spec: mujoco.MjSpec, p: Mapping[str, float]) -> None:
+    spec.joints[0].armature += p["inertia"]
+
+
+def _add_payload(spec: mujoco.MjSpec, p: Mapping[str, float]) -> None:
+    spec.bodies[-1].add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=[1e-3, 0, 0],
+        pos=[0, 0, p["z"]],
+        mass=p["mass"],
+        contype=0,
+        conaffinity=0,
+    )
+
+
+def _scale_gravity(spec: mujoco.MjSpec, p: Mapping[str, float]) -> None:
+    spec.option.gravity = spec.option.gravity * p["scale"]
+
+
+SECRETS: dict[str, Secret] = {
+    "none": Secret(""),
+    "viscous_damping": Secret("joint", {"coefficient": 0.03}, change=_add_damping),
+    "coulomb_friction": Secret("joint", {"torque": 0.06}, change=_add_friction),
+    "torque_offset": Secret("joint", {"torque": 0.1}, force=lambda t, v, p: p["torque"]),
+    "rotor_inertia": Secret("joint", {"inertia": 0.01}, change=_add_armature),
+    "motor_gain": Secret("actuator", {"scale": 0.25}, gain=lambda t, p: p["scale"]),
+    "actuator_delay": Secret("actuator", {"delay": 0.02}, late=lambda p: p["delay"]),
+    "payload_mass": Secret("body", {"mass": 0.1, "z": -0.5}, change=_add_payload),
+    "gravity_scale": Secret("world", {"scale": 0.15}, change=_scale_gravity),
+    "periodic_disturbance": Secret(
+        "joint", {"torque": 0.15}, force=lambda t, v, p: p["torque"] * np.sin(2 * np.pi * 1.7 * t)
+    ),
+    "fading_gain": Secret(
+        "actuator", {"rate": 0.05}, gain=lambda t, p: max(0.0, 1.0 - p["rate"] * t)
+    ),
+}
+"""Names are the catalogue's; the last two are outside it."""
+DRAWN = tuple(
+    name for name in SECRETS if name not in ("none", "periodic_disturbance", "fading_gain")
+)
+
+
+def draw(kind: str, rng: np.random.Generator) -> dict[str, float]:
+    """Draw the parameters of a hidden effect: well visible, of either sign where it can be."""
+    factor = rng.uniform(*SIZE_RANGE)
+    sign = rng.choice([-1.0, 1.0])
+    typical = SECRETS[kind].parameters
+    if kind in ("motor_gain", "gravity_scale"):
+        return {"scale": 1.0 + sign * factor * typical["scale"]}
+    if kind == "torque_offset":
+        return {"torque": sign * factor * typical["torque"]}
+    if kind == "payload_mass":
+        return {"mass": factor * typical["mass"], "z": typical["z"] * rng.uniform(0.8, 1.0)}
+    return {name: factor * size for name, size in typical.items()}
+
+
+def excite(index: int, time: np.ndarray, limit: float, rng: np.random.Generator) -> np.ndarray:
+    """Make a command [T]: multi-sine, steps, slow reversals, or steps on a multi-sine, in turn."""
+    frequencies = np.asarray([0.23, 0.41, 0.71, 1.1, 1.7])
+    phases = rng.uniform(0, 2 * np.pi, len(frequencies))
+    sines = np.sin(2 * np.pi * time[:, None] * frequencies + phases).mean(axis=1) * 1.5
+    count = int(np.ceil(time[-1] / 0.4)) + 1
+    steps = rng.uniform(-1, 1, count)[(time / 0.4).astype(int)]
+    slow = np.sin(2 * np.pi * rng.uniform(0.2, 0.3) * time)
+    return limit * np.stack([sines, steps, slow, 0.5 * sines + 0.5 * steps])[index % 4]
+
+
+def simulate(
+    mjcf: Path, secret: Secret, parameters: Mapping[str, float], time: np.ndarray, ctrl: np.ndarray
+) -> np.ndarray:
+    """Step C MuJoCo under held commands and return the true state at each sample, [T, nq + nv]."""
+    spec = mujoco.MjSpec.from_file(str(mjcf))
+    secret.change(spec, parameters)
+    rate = time[1] - time[0]
+    substeps = int(np.ceil(rate / spec.option.timestep - 1e-9)) * REFINEMENT
+    spec.option.timestep = rate / substeps
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    delay = round(secret.late(parameters) / model.opt.timestep)
+    states = np.zeros((len(time), model.nq + model.nv))
+    for k in range(len(time)):
+        states[k] = np.concatenate([data.qpos, data.qvel])
+        for i in range(substeps):
+            row = max(k * substeps + i - delay, 0) // substeps
+            data.ctrl[:] = ctrl[row] * secret.gain(data.time, parameters)
+            data.qfrc_applied[0] = secret.force(data.time, data.qvel[0], parameters)
+            mujoco.mj_step(model, data)
+    return states
+
+
+def make_recordings(
+    mjcf: Path,
+    out: Path,
+    seed: int,
+    num_recordings: int = 4,
+    seconds: float = 8.0,
+    rate: float = 250.0,
+    kind: str | None = None,
+) -> Hidden:
+    """Write recordings of a one-motor pendulum that differs from its model by a hidden effect.
+
+    Args:
+        mjcf: The model; its first joint and actuator carry the effect.
+        out: Folder for the CSV files.
+        seed: Draws the effect, its size, the excitation and the sensor noise.
+        num_recordings: How many files; the last quarter (at least one) is held out.
+        seconds: Length of each.
+        rate: Samples a second.
+        kind: A name in `SECRETS` instead of one drawn from the seed.
+    """
+    rng = np.random.default_rng(seed)
+    drawn = str(rng.choice(DRAWN))
+    kind = kind or drawn
+    parameters = draw(kind, rng)
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    joint, actuator = model.joint(0).name, model.actuator(0).name
+    time = np.arange(round(seconds * rate)) / rate
+    out.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for index in range(num_recordings):
+        ctrl = excite(index, time, 0.4 * model.actuator_ctrlrange[0, 1], rng)
+        state = simulate(mjcf, SECRETS[kind], parameters, time, ctrl[:, None])
+        state = state + rng.normal(size=state.shape) * [ANGLE_NOISE, SPEED_NOISE]
+        paths.append(out / f"recording_{index}.csv")
+        header = ["time", f"qpos.{joint}", f"qvel.{joint}", f"ctrl.{actuator}"]
+        _write(paths[-1], header, np.column_stack([time, state, ctrl]))
+    num_holdout = max(1, num_recordings // 4)
+    names = {"joint": joint, "actuator": actuator, "body": model.body(model.nbody - 1).name}
+    element = SECRETS[kind].element
+    target = f"{element}/{names[element]}" if element in names else element
+    return Hidden(
+        tuple(paths[:-num_holdout]), tuple(paths[-num_holdout:]), kind, target, parameters
+    )
+
+
+def _write(path: Path, header: list[str], rows: np.ndarray) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows([f"{value:.9g}" for value in row] for row in rows)

@@ -1,0 +1,392 @@
+"""Decide which effects are missing: fit the best candidates and let only those pass every gate.
+
+Forward selection with full refits. The gates are evidence (corrected p-value), a physically
+possible sign, the share explained, the fall of the held-out error and its lead over the
+runner-up, each with a block-bootstrap interval, and stability over block resamples.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from garat_jax.diagnosis.fit import Fit, Problem, StartSpace, block_labels, fit, linearise, settle
+from garat_jax.diagnosis.results import Candidate, Estimate, Interval, Named
+from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, screen
+from garat_jax.effects import unit_at
+
+ABOVE_FLOOR = 1.5
+"""A model is adequate up to this multiple of the noise floor."""
+SMALLEST_SHARE = 0.05
+"""Share of the residual that an effect must explain."""
+SIGNIFICANCE = 0.01
+"""Largest corrected p-value."""
+STABLE = 0.8
+"""Share of block resamples in which an effect must be first."""
+TOO_CLOSE = 1.05
+"""Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
+CONTENDERS = 4
+"""How many candidates are fitted each round, besides those that are like the first."""
+ROUNDS = 5
+RESAMPLES = 500
+
+
+class Metric(NamedTuple):
+    """The error that is reported: see `results.Errors`.
+
+    Attributes:
+        weight: Squared metric of one squared whitened residual, [N].
+        counted: Which residuals are samples and not padding, [S, N].
+        spread: Standard deviation of each signal in the held-out data, [num_signals].
+    """
+
+    weight: np.ndarray
+    counted: np.ndarray
+    spread: np.ndarray
+
+    def error(self, residual: np.ndarray, chosen: np.ndarray) -> float:
+        """Return the root mean square over samples and signals of the chosen segments."""
+        squares = residual[chosen] ** 2 * self.weight
+        return float(np.sqrt(squares.sum() / max(self.counted[chosen].sum(), 1)))
+
+    def by_signal(self, residual: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """Return the error of each signal in units of its noise, [num_signals]."""
+        num_signals = len(self.spread)
+        squares = (residual[chosen] ** 2 * self.counted[chosen]).reshape(-1, num_signals)
+        return np.sqrt(squares.sum(axis=0) / self.counted[chosen].sum() * num_signals)
+
+
+@dataclasses.dataclass(frozen=True)
+class Contender:
+    """A candidate that was fitted.
+
+    Attributes:
+        score: What screening said.
+        fit: All selected effects and this one, fitted.
+    """
+
+    score: Score
+    fit: Fit
+
+
+class Step(NamedTuple):
+    """One effect that was added, and the fit with it."""
+
+    candidate: Candidate
+    effect: int
+    fit: Fit
+
+
+class Outcome(NamedTuple):
+    """What forward selection found.
+
+    Attributes:
+        before: The model as it is, initial states settled.
+        after: With all selected effects.
+        candidates: The first round's candidates, best first.
+        steps: The effects added, in order, each with the fit at the time.
+        selected: The effects kept in the end, with their final parameters.
+        floor: Noise floor of the metric on the held-out segments.
+        adequate: Whether the model as it is comes near its noise floor in every signal.
+    """
+
+    before: Fit
+    after: Fit
+    candidates: tuple[Candidate, ...]
+    steps: tuple[Step, ...]
+    selected: tuple[Candidate, ...]
+    floor: float
+    adequate: bool
+
+
+def make_metric(problem: Problem) -> Metric:
+    """Make the metric: errors relative to each signal's spread in the held-out data."""
+    s = problem.segments
+    held_out = (s.weight > 0) & ~problem.fitted[:, None]
+    spread = s.measured[held_out].std(axis=0) + 1e-12
+    weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
+    return Metric(weight, np.repeat(s.weight > 0, s.measured.shape[2], axis=1), spread)
+
+
+class Floor(NamedTuple):
+    """The held-out error that noise and the integrator's error would make by themselves.
+
+    Attributes:
+        error: In the metric.
+        by_signal: In units of each signal's noise, [num_signals].
+    """
+
+    error: float
+    by_signal: np.ndarray
+
+
+def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
+    """Estimate the noise floor; a first-order integrator errs by twice what half a step changes."""
+    held_out = ~problem.fitted
+    lin = linearise(problem, current.theta, current.start, (), ())
+    change = 2.0 * problem.integrator_error(current.theta, current.start)[..., None]
+    change = StartSpace(lin.start).remove(change)[..., 0]
+    noise = metric.counted.astype(float)
+    return Floor(
+        float(np.hypot(metric.error(noise, held_out), metric.error(change, held_out))),
+        np.hypot(1.0, metric.by_signal(change, held_out)),
+    )
+
+
+def is_above(problem: Problem, metric: Metric, current: Fit, floor: Floor) -> bool:
+    """Say whether any signal's held-out error is well above its noise floor."""
+    errors = metric.by_signal(current.residual, ~problem.fitted)
+    return bool(np.any(errors > ABOVE_FLOOR * floor.by_signal))
+
+
+def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> Outcome:
+    """Add effects as long as one passes every gate.
+
+    Args:
+        problem: The recordings and the model with every candidate.
+        start: Initial states to start from, [S, nq + nv].
+        say: Told what is being done.
+    """
+    metric = make_metric(problem)
+    say("the model as it is")
+    before = settle(problem, problem.simulator.base, start)
+    floor = noise_floor(problem, metric, before)
+    adequate = not is_above(problem, metric, before, floor)
+    current, steps, first_round = before, [], ()
+    for number in range(ROUNDS):
+        held = [step.effect for step in steps]
+        say(f"scoring the candidates, round {number + 1}")
+        scores = screen(problem, current, held)
+        gap = is_above(problem, metric, current, floor)
+        contenders = _fit_contenders(problem, current, scores, say) if gap else []
+        judged = _judge(problem, metric, current, scores, contenders, gap)
+        first_round = first_round or tuple(candidate for candidate, _ in judged)
+        candidate, contender = judged[0] if judged else (None, None)
+        if candidate is None or contender is None or not candidate.passes:
+            break
+        current = contender.fit
+        steps.append(Step(candidate, contender.score.effect, current))
+        steps, current = _prune(problem, before, steps, current, say)
+        floor = noise_floor(problem, metric, current)
+    selected = tuple(_refreshed(problem, step, current) for step in steps)
+    candidates = _without_superfluous(first_round, selected)
+    return Outcome(before, current, candidates, tuple(steps), selected, floor.error, adequate)
+
+
+def _fit_contenders(problem, current: Fit, scores: Sequence[Score], say) -> list[Contender]:
+    likely = [s for s in scores if not s.excluded and s.possible and s.share > 0.02]
+    likely = [s for s in likely if s.share > 0.25 * likely[0].share]
+    if not likely:
+        return []
+    chosen = likely[:CONTENDERS]
+    chosen += [s for s in likely[CONTENDERS:] if cosine(s, likely[0]) > EQUIVALENT]
+    contenders = []
+    for score in chosen:
+        effect = problem.simulator.effects[score.effect]
+        say(f"fitting {effect.kind} at {effect.target}")
+        contenders.append(Contender(score, _fit_with(problem, current, score)))
+    return contenders
+
+
+def _fit_with(problem: Problem, current: Fit, score: Score) -> Fit:
+    """Fit the selected effects and one more, from its expected size kept within bounds."""
+    theta = current.theta.copy()
+    for j, size in zip(score.columns, score.size, strict=True):
+        p = problem.simulator.slots[j].parameter
+        theta[j] = np.clip(size, p.low, p.high)
+    first = score.columns[0]
+    base, scale = problem.simulator.base[first], problem.simulator.slots[first].parameter.scale
+    if abs(theta[first] - base) < 1e-3 * scale:
+        theta[first] = base + 0.1 * scale
+    for j in score.columns[1:]:
+        theta[j] = problem.simulator.base[j]
+    return fit(problem, theta, current.start, (*current.free, *score.columns))
+
+
+def _block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):
+    """Return each fit's cost in each block of the chosen segments, [num_fits, num_blocks]."""
+    labels = np.unique(block_labels(problem)[chosen].ravel(), return_inverse=True)[1]
+    return np.stack([np.bincount(labels, (f.residual[chosen] ** 2 * weight).ravel()) for f in fits])
+
+
+def _resamples(num_blocks: int) -> np.ndarray:
+    """Return how often each block is drawn, [RESAMPLES, num_blocks]."""
+    rng = np.random.default_rng(0)
+    return rng.multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), RESAMPLES)
+
+
+def _judge(problem, metric: Metric, current: Fit, scores, contenders: list[Contender], gap: bool):
+    """Return (candidate, contender or None) for every score, best first."""
+    judged = []
+    if contenders:
+        costs = _block_costs(problem, 1.0, [c.fit for c in contenders], slice(None))
+        num_blocks = costs.shape[1]
+        penalty = [len(c.score.columns) * np.log(num_blocks) / num_blocks for c in contenders]
+        criterion = np.log(costs.sum(axis=1)) + penalty
+        drawn = np.log(_resamples(num_blocks) @ costs.T) + penalty
+        for index in np.argsort(criterion):
+            judged.append(_judge_one(problem, metric, current, contenders, int(index), drawn))
+        judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
+    fitted = [c.score.effect for c in contenders]
+    near = "the model's error is near the noise floor" if not gap else "others explain more"
+    for score in scores:
+        if score.effect not in fitted:
+            sign = "its sign is physically impossible" if not score.possible else near
+            judged.append((_unfitted(problem, score, score.excluded or sign), None))
+    return judged
+
+
+def _alike(contenders: list[Contender], current: Fit, drawn: np.ndarray, index: int) -> list[int]:
+    """Return the contenders that these recordings cannot tell from one of them."""
+    change = [(c.fit.residual - current.residual).ravel() for c in contenders]
+    size = [float(np.linalg.norm(c)) or 1.0 for c in change]
+    alike = []
+    for other in range(len(contenders)):
+        if other == index:
+            continue
+        same = cosine(contenders[index].score, contenders[other].score)
+        same = max(same, abs(float(change[index] @ change[other])) / (size[index] * size[other]))
+        lead = np.quantile(drawn[:, other] - drawn[:, index], [0.025, 0.5, 0.975])
+        close = lead[0] < 0 < lead[2] or abs(lead[1]) < np.log(TOO_CLOSE)
+        if same > EQUIVALENT and close:
+            alike.append(other)
+    return alike
+
+
+def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, drawn):
+    contender, held_out = contenders[index], ~problem.fitted
+    alike = _alike(contenders, current, drawn, index)
+    others = [i for i in range(len(contenders)) if i != index and i not in alike]
+    stability = float(np.mean(np.isin(drawn.argmin(axis=1), [index, *alike])))
+    lead = np.inf
+    if others:
+        lead = float(np.quantile(drawn[:, others].min(axis=1) - drawn[:, index], 0.025))
+    gain = _gain(problem, metric, current, contender.fit, held_out)
+    share = 1.0 - contender.fit.cost[problem.fitted].sum() / current.cost[problem.fitted].sum()
+    why = _failed_gate(contender.score, share, gain, lead, stability)
+    effects = problem.simulator.effects
+    named = [effects[contenders[i].score.effect] for i in alike]
+    candidate = Candidate(
+        effect=effects[contender.score.effect].kind,
+        target=effects[contender.score.effect].target,
+        parameters=_estimates(problem, contender.score.effect, contender.fit),
+        share=float(share),
+        p_value=contender.score.p_value,
+        error_after=metric.error(contender.fit.residual, held_out),
+        held_out_gain=gain,
+        stability=stability,
+        indistinguishable_from=tuple(Named(e.kind, e.target) for e in named),
+        passes=not why,
+        why=why or "passes every gate",
+    )
+    return candidate, contender
+
+
+def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stability: float) -> str:
+    """Return the first gate that is failed, or an empty string."""
+    if score.p_value > SIGNIFICANCE:
+        return f"not significant (corrected p = {score.p_value:.2g})"
+    if share < SMALLEST_SHARE:
+        return f"explains only {100 * share:.1f} % of the residual"
+    if gain.low <= 0:
+        return "the held-out error does not fall for certain"
+    if lead <= 0:
+        return "its lead over the runner-up is not certain"
+    if stability < STABLE:
+        return f"first in only {100 * stability:.0f} % of the resamples"
+    return ""
+
+
+def _gain(problem, metric: Metric, before: Fit, after: Fit, held_out) -> Interval:
+    """Return the fall of the held-out error with a block-bootstrap interval."""
+    costs = _block_costs(problem, metric.weight, [before, after], held_out)
+    count = max(metric.counted[held_out].sum(), 1)
+    drawn = np.sqrt(_resamples(costs.shape[1]) @ costs.T / count)
+    whole = np.sqrt(costs.sum(axis=1) / count)
+    low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [0.025, 0.975])
+    return Interval(float(whole[0] - whole[1]), float(low), float(high))
+
+
+def _estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate]:
+    """Return the fitted parameters of an effect, and those that keep another than their nominal."""
+    simulator = problem.simulator
+    estimates = {}
+    for j, slot in enumerate(simulator.slots):
+        if slot.effect != effect:
+            continue
+        unit = unit_at(slot.parameter, simulator.host, simulator.effects[effect].target)
+        if j in fitted.free and j not in fitted.frozen:
+            at = fitted.free.index(j)
+            low, high = float(fitted.low[at]), float(fitted.high[at])
+            estimates[slot.parameter.name] = Estimate(float(fitted.theta[j]), low, high, unit)
+        elif fitted.theta[j] != slot.parameter.nominal:
+            value = float(fitted.theta[j])
+            estimates[slot.parameter.name] = Estimate(value, float("nan"), float("nan"), unit)
+    return estimates
+
+
+def _unfitted(problem: Problem, score: Score, why: str) -> Candidate:
+    simulator, nan = problem.simulator, float("nan")
+    effect = simulator.effects[score.effect]
+    parameters = {}
+    for j, size in zip(score.columns, score.size, strict=False):
+        p = simulator.slots[j].parameter
+        parameters[p.name] = Estimate(size, nan, nan, unit_at(p, simulator.host, effect.target))
+    return Candidate(
+        effect=effect.kind,
+        target=effect.target,
+        parameters=parameters,
+        share=score.share,
+        p_value=score.p_value,
+        error_after=nan,
+        held_out_gain=Interval(nan, nan, nan),
+        stability=0.0,
+        indistinguishable_from=(),
+        passes=False,
+        why=why,
+    )
+
+
+def _prune(problem: Problem, before: Fit, steps: list[Step], current: Fit, say):
+    """Drop effects that a later one made superfluous: without them the cost stays as it is."""
+    kept = steps
+    for step in steps[:-1]:
+        say(f"trying without {step.candidate.named}")
+        without = _fit_only(problem, current, [s.effect for s in kept if s.effect != step.effect])
+        costs = _block_costs(problem, 1.0, [without, current], slice(None))
+        drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
+        lead = drawn[:, 0] - drawn[:, 1]
+        if np.quantile(lead, 0.025) <= 0 or np.median(lead) < np.log(TOO_CLOSE):
+            kept = [other for other in kept if other.effect != step.effect]
+            current = without
+    if len(kept) == len(steps):
+        return steps, current
+    again = [_fit_only(problem, current, [s.effect for s in kept[:n]]) for n in range(1, len(kept))]
+    return [s._replace(fit=f) for s, f in zip(kept, (*again, current), strict=True)], current
+
+
+def _fit_only(problem: Problem, current: Fit, effects: Sequence[int]) -> Fit:
+    """Fit again with some of the selected effects, the others back at no effect."""
+    slots = problem.simulator.slots
+    present = np.asarray([slot.effect in effects for slot in slots])
+    theta = np.where(present, current.theta, problem.simulator.base)
+    return fit(problem, theta, current.start, [j for j in current.free if present[j]])
+
+
+def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
+    """Where a later effect replaced the first one, say so and put the effects kept first."""
+    kept = {c.named: place for place, c in enumerate(selected)}
+    corrected = []
+    for candidate in candidates:
+        if candidate.passes and candidate.named not in kept:
+            why = f"superfluous with {' and '.join(map(str, kept))}"
+            candidate = dataclasses.replace(candidate, passes=False, why=why)
+        corrected.append(candidate)
+    dropped = any("superfluous" in c.why for c in corrected)
+    return tuple(sorted(corrected, key=lambda c: kept.get(c.named, len(kept)) if dropped else 0))
+
+
+def _refreshed(problem: Problem, step: Step, final: Fit) -> Candidate:
+    """Return a selected effect with its parameters from the final fit."""
+    return dataclasses.replace(step.candidate, parameters=_estimates(problem, step.effect, final))

@@ -1,0 +1,173 @@
+"""What a diagnosis says: typed, printable, and the content of diagnosis.json."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from garat_jax.diagnosis.localise import Place
+from garat_jax.runs import finite_or_null, to_plain
+
+FORMAT = "garat-diagnosis/1"
+Verdict = Literal["adequate", "missing_effect", "unexplained"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """A number with its 95 % interval."""
+
+    estimate: float
+    low: float
+    high: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate(Interval):
+    """A parameter with its 95 % interval and unit; the ends are NaN where the data say nothing."""
+
+    unit: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Named:
+    """An effect at a place."""
+
+    effect: str
+    target: str
+
+    def __str__(self) -> str:
+        return f"{self.effect} at {self.target}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """An effect that may be missing, and what the recordings say about it.
+
+    Attributes:
+        effect: Its kind.
+        target: Where it would act.
+        parameters: Estimates by name.
+        share: Share of the fitted residual's squares that it explains.
+        p_value: Corrected for the number of candidates.
+        error_after: Held-out error with the effect, NaN if it was not fitted.
+        held_out_gain: How much the held-out error falls.
+        stability: Share of block resamples in which it, or one indistinguishable from it, is first.
+        indistinguishable_from: Effects that these recordings cannot tell from it.
+        passes: Whether it passes every gate.
+        why: The gate that it fails, or what speaks for it.
+    """
+
+    effect: str
+    target: str
+    parameters: Mapping[str, Estimate]
+    share: float
+    p_value: float
+    error_after: float
+    held_out_gain: Interval
+    stability: float
+    indistinguishable_from: tuple[Named, ...]
+    passes: bool
+    why: str
+
+    @property
+    def named(self) -> Named:
+        """The effect and its place."""
+        return Named(self.effect, self.target)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rung:
+    """One step of the ladder: the errors once an effect was added."""
+
+    added: Candidate | None
+    error_fit: float
+    error_holdout: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Errors:
+    """Held-out prediction error.
+
+    Attributes:
+        metric: How it is measured, the horizon among it.
+        unit: "1": relative to each signal's standard deviation.
+        before: Of the model as it is.
+        after: With every selected effect.
+        noise_floor: What noise and the integrator's own error make.
+        unexplained_share: What is left above the floor, over `before`.
+        per_signal: By signal: before, after, noise_floor and the signal's unit, in that unit.
+    """
+
+    metric: str
+    unit: str
+    before: float
+    after: float
+    noise_floor: float
+    unexplained_share: float
+    per_signal: Mapping[str, Mapping[str, float | str]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """What to record next to tell indistinguishable effects apart."""
+
+    separates: tuple[Named, ...]
+    how: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """Where a model fails and which effect it is missing; fields as in diagnosis.json."""
+
+    model: str
+    data: tuple[str, ...]
+    holdout: tuple[str, ...]
+    versions: Mapping[str, str | None]
+    seconds: float
+    verdict: Verdict
+    error: Errors
+    where: tuple[Place, ...]
+    candidates: tuple[Candidate, ...]
+    selected: tuple[Candidate, ...]
+    ladder: tuple[Rung, ...]
+    next_experiment: Experiment | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of diagnosis.json; what is not finite is null."""
+        return {"format": FORMAT, **finite_or_null(to_plain(self))}
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong, in one sentence."""
+        error = self.error
+        fall = f"held-out error {error.before:.3g} → {error.after:.3g}"
+        if self.verdict == "adequate":
+            return (
+                f"The model is adequate: its held-out error {error.before:.3g} is near the noise "
+                f"floor {error.noise_floor:.3g}."
+            )
+        names = " and ".join(str(c.named) for c in self.selected)
+        if self.verdict == "missing_effect":
+            return f"Missing: {names} ({fall}, noise floor {error.noise_floor:.3g})."
+        share = f"{100 * error.unexplained_share:.0f} % of the error"
+        if names:
+            return f"{names} explain a part ({fall}), but {share} stays unexplained."
+        return f"Nothing in the catalogue explains the error: {share} stays unexplained."
+
+    def __str__(self) -> str:
+        lines = [self.sentence]
+        lines += [f"  where: {place.evidence}" for place in self.where[:3]]
+        for c in self.candidates[:6]:
+            values = ", ".join(
+                f"{name} {v.estimate:.4g} [{v.low:.4g}, {v.high:.4g}] {v.unit}"
+                for name, v in c.parameters.items()
+            )
+            lines.append(
+                f"  {'*' if c.passes else ' '} {c.named}: {values}; share {c.share:.2f}, "
+                f"held-out error {c.error_after:.3g}, stability {c.stability:.2f}; {c.why}"
+            )
+        for rung in self.ladder:
+            added = str(rung.added.named) if rung.added else "the model as it is"
+            lines.append(f"  {added}: fit {rung.error_fit:.4g}, held-out {rung.error_holdout:.4g}")
+        if self.next_experiment:
+            lines.append(f"  next: {self.next_experiment.how}")
+        return "\n".join(lines)
