@@ -32,7 +32,9 @@ class InvertedPendulum(Task):
 
     def initial(self, host: mujoco.MjModel, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Draw a state near rest, uniformly."""
-        noise = jax.random.uniform(key, (host.nq + host.nv,), minval=-RESET_NOISE, maxval=RESET_NOISE)
+        noise = jax.random.uniform(
+            key, (host.nq + host.nv,), minval=-RESET_NOISE, maxval=RESET_NOISE
+        )
         return noise[: host.nq], noise[host.nq :]
 
     def observe(self, state: PhysicsState) -> jax.Array:

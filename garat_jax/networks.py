@@ -1,11 +1,17 @@
 """Flax networks: policies, value functions, discriminators."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import distrax
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+
+
+def forward(network: nn.Module, weights: Any, inputs: jax.Array) -> Any:
+    """Apply a network; Flax's `apply` may also return variables, which none of ours has."""
+    return network.apply(weights, inputs)
 
 
 class MLP(nn.Module):
@@ -53,9 +59,7 @@ class GaussianPolicy(nn.Module):
         log_std = self.param(
             "log_std", nn.initializers.constant(self.initial_log_std), (self.size,)
         )
-        return distrax.MultivariateNormalDiag(
-            mean, jnp.broadcast_to(jnp.exp(log_std), mean.shape)
-        )
+        return distrax.MultivariateNormalDiag(mean, jnp.broadcast_to(jnp.exp(log_std), mean.shape))
 
 
 class ValueNet(nn.Module):

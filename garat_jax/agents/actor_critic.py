@@ -10,7 +10,7 @@ from brax.training.acme import running_statistics, specs
 from garat_jax import rollout
 from garat_jax.agents import advantage
 from garat_jax.env import Env, EnvState
-from garat_jax.networks import GaussianPolicy, ValueNet
+from garat_jax.networks import GaussianPolicy, ValueNet, forward
 from garat_jax.types import Params, Policy, Transition
 
 
@@ -68,11 +68,11 @@ def make_policy(network: GaussianPolicy) -> tuple[Policy, Any]:
     """Return the stochastic policy and its mean action, both on raw observations."""
 
     def sample(params: PolicyParams, obs: jax.Array, key: jax.Array):
-        distribution = network.apply(params.weights, normalise(params, obs))
+        distribution = forward(network, params.weights, normalise(params, obs))
         return distribution.sample_and_log_prob(seed=key)
 
     def mean(params: PolicyParams, obs: jax.Array) -> jax.Array:
-        return network.apply(params.weights, normalise(params, obs)).loc
+        return forward(network, params.weights, normalise(params, obs)).loc
 
     return sample, mean
 
@@ -107,7 +107,7 @@ def prepare(
 ) -> Batch:
     """Estimate advantages and flatten the batch; observations come out normalised."""
     obs, next_obs = normalise(state.policy, jnp.stack([transitions.obs, transitions.next_obs]))
-    values = value.apply(state.value, jnp.stack([obs, next_obs]))
+    values = forward(value, state.value, jnp.stack([obs, next_obs]))
     advantages, targets = advantage.gae(transitions, values[0], values[1], discount, trace)
     batch = Batch(
         obs=obs,

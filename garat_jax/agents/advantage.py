@@ -37,9 +37,7 @@ def gae(
         advantage = delta + discount * trace * carries_on * advantage
         return advantage, advantage
 
-    _, advantage = jax.lax.scan(
-        step, jnp.zeros_like(delta[0]), (delta, carries_on), reverse=True
-    )
+    _, advantage = jax.lax.scan(step, jnp.zeros_like(delta[0]), (delta, carries_on), reverse=True)
     return advantage, advantage + value
 
 

@@ -1,6 +1,7 @@
 """Proximal policy optimisation (Schulman et al. 2017, arXiv 1707.06347)."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import optax
 from garat_jax.agents import actor_critic
 from garat_jax.agents.actor_critic import ActorCriticState, Batch
 from garat_jax.env import Env
-from garat_jax.networks import GaussianPolicy, ValueNet
+from garat_jax.networks import GaussianPolicy, ValueNet, forward
 from garat_jax.types import Agent, Params
 
 
@@ -50,8 +51,8 @@ def make(env: Env, config: PPOConfig) -> Agent:
 
     def loss(weights, batch: Batch) -> tuple[jax.Array, dict[str, jax.Array]]:
         policy_weights, value_weights = weights
-        distribution = policy_net.apply(policy_weights, batch.obs)
-        value = value_net.apply(value_weights, batch.obs)
+        distribution = forward(policy_net, policy_weights, batch.obs)
+        value = forward(value_net, value_weights, batch.obs)
         return ppo_loss(distribution, value, batch, config)
 
     def minibatch_step(carry, batch: Batch):
@@ -61,22 +62,16 @@ def make(env: Env, config: PPOConfig) -> Agent:
         return (optax.apply_updates(weights, updates), optimiser_state), metrics
 
     def step(state: ActorCriticState, env_params: Params):
-        state, transitions = actor_critic.collect(
-            env, env_params, policy, state, config.num_steps
-        )
-        batch = actor_critic.prepare(
-            value_net, state, transitions, config.discount, config.trace
-        )
+        state, transitions = actor_critic.collect(env, env_params, policy, state, config.num_steps)
+        batch = actor_critic.prepare(value_net, state, transitions, config.discount, config.trace)
 
         def epoch(carry, key):
             shuffled = actor_critic.minibatches(batch, key, config.num_minibatches)
             return jax.lax.scan(minibatch_step, carry, shuffled)
 
         key, epoch_key = jax.random.split(state.key)
-        carry = ((state.policy.weights, state.value), state.optimiser)
-        carry, metrics = jax.lax.scan(
-            epoch, carry, jax.random.split(epoch_key, config.num_epochs)
-        )
+        carry: Any = ((state.policy.weights, state.value), state.optimiser)
+        carry, metrics = jax.lax.scan(epoch, carry, jax.random.split(epoch_key, config.num_epochs))
         (weights, value), optimiser_state = carry
         state = state._replace(
             policy=state.policy._replace(weights=weights),

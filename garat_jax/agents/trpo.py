@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from garat_jax.agents import actor_critic
 from garat_jax.agents.actor_critic import ActorCriticState, Batch
 from garat_jax.env import Env
-from garat_jax.networks import GaussianPolicy, ValueNet
+from garat_jax.networks import GaussianPolicy, ValueNet, forward
 from garat_jax.types import Agent, Params
 
 
@@ -51,7 +51,7 @@ def make(env: Env, config: TRPOConfig) -> Agent:
         weights, optimiser_state = carry
 
         def loss(weights):
-            error = value_net.apply(weights, batch.obs) - batch.value_target
+            error = forward(value_net, weights, batch.obs) - batch.value_target
             return jnp.mean(jnp.square(error))
 
         value_loss, grads = jax.value_and_grad(loss)(weights)
@@ -59,19 +59,13 @@ def make(env: Env, config: TRPOConfig) -> Agent:
         return (optax.apply_updates(weights, updates), optimiser_state), value_loss
 
     def step(state: ActorCriticState, env_params: Params):
-        state, transitions = actor_critic.collect(
-            env, env_params, policy, state, config.num_steps
-        )
-        batch = actor_critic.prepare(
-            value_net, state, transitions, config.discount, config.trace
-        )
+        state, transitions = actor_critic.collect(env, env_params, policy, state, config.num_steps)
+        batch = actor_critic.prepare(value_net, state, transitions, config.discount, config.trace)
         weights, metrics = policy_step(policy_net, state.policy.weights, batch, config)
 
         def epoch(carry, key):
             number = batch.action.shape[0] // config.value_minibatch
-            return jax.lax.scan(
-                value_step, carry, actor_critic.minibatches(batch, key, number)
-            )
+            return jax.lax.scan(value_step, carry, actor_critic.minibatches(batch, key, number))
 
         key, value_key = jax.random.split(state.key)
         (value, optimiser_state), value_loss = jax.lax.scan(
@@ -108,23 +102,21 @@ def policy_step(
         and metrics.
     """
     flat, unflatten = ravel_pytree(weights)
-    before = network.apply(weights, batch.obs)
+    before = forward(network, weights, batch.obs)
 
     def surrogate(flat: jax.Array) -> jax.Array:
-        log_prob = network.apply(unflatten(flat), batch.obs).log_prob(batch.action)
+        log_prob = forward(network, unflatten(flat), batch.obs).log_prob(batch.action)
         return jnp.mean(jnp.exp(log_prob - batch.log_prob) * batch.advantage)
 
     def kl(flat: jax.Array) -> jax.Array:
-        return jnp.mean(before.kl_divergence(network.apply(unflatten(flat), batch.obs)))
+        return jnp.mean(before.kl_divergence(forward(network, unflatten(flat), batch.obs)))
 
     base, gradient = jax.value_and_grad(surrogate)(flat)
     fisher = fisher_vector_product(network, flat, unflatten, batch.obs, config.cg_damping)
     direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
     curvature = direction @ fisher(direction)
     full_step = direction * jnp.sqrt(2 * config.max_kl / jnp.maximum(curvature, 1e-12))
-    flat, fraction = line_search(
-        flat, full_step, lambda x: (surrogate(x) - base, kl(x)), config
-    )
+    flat, fraction = line_search(flat, full_step, lambda x: (surrogate(x) - base, kl(x)), config)
     return unflatten(flat), {
         "kl": kl(flat),
         "surrogate": surrogate(flat) - base,
@@ -147,7 +139,7 @@ def fisher_vector_product(
     """
 
     def moments(flat: jax.Array):
-        distribution = network.apply(unflatten(flat), obs)
+        distribution = forward(network, unflatten(flat), obs)
         return distribution.loc, jnp.log(distribution.scale_diag)
 
     (_, log_std), push = jax.linearize(moments, flat)

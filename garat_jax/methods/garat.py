@@ -22,7 +22,7 @@ from garat_jax.methods.grounded import (
     TransformerParams,
     decode_action,
 )
-from garat_jax.networks import Discriminator
+from garat_jax.networks import Discriminator, forward
 from garat_jax.types import Metrics, Params, Policy, Transition
 
 
@@ -31,8 +31,14 @@ class GARATConfig:
     """Hyper-parameters; docs/grounding.md has the measurements behind the defaults."""
 
     transformer: PPOConfig = dataclasses.field(
-        # A standard deviation of one half-range lets the discriminator separate on noise alone.
-        default_factory=lambda: PPOConfig(initial_log_std=-2.0)
+        default_factory=lambda: PPOConfig(
+            initial_log_std=-2.0,  # one half-range lets D separate on noise alone
+            num_epochs=10,
+            num_minibatches=8,
+            clip=0.3,  # 0.1 bounds how far so small a deviation can move in 50 updates
+            discount=0.0,  # -log D is about one transition; a later one is no credit to this
+            trace=0.0,
+        )
     )
     output: Output = "change"
     reach: float = 1.0
@@ -103,8 +109,8 @@ class GARAT:
         self, params: RewardParams, obs: jax.Array, action: jax.Array, next_obs: jax.Array
     ) -> jax.Array:
         """Return -log D of a transition, less the offset, []."""
-        logit = self.network.apply(
-            params.weights, features(params.normaliser, obs, action, next_obs)
+        logit = forward(
+            self.network, params.weights, features(params.normaliser, obs, action, next_obs)
         )
         return jax.nn.softplus(-logit) - params.offset
 
@@ -170,20 +176,20 @@ class GARAT:
         (weights, optimiser), metrics = jax.lax.scan(
             minibatch_step, (reward.weights, optimiser), (batches, wanted[picks], keys)
         )
-        mean_reward = jnp.mean(jax.nn.softplus(-self.network.apply(weights, grounded)))
+        mean_reward = jnp.mean(jax.nn.softplus(-forward(self.network, weights, grounded)))
         offset = mean_reward if self.config.centre_reward else jnp.zeros(())
         reward = reward._replace(weights=weights, offset=offset)
         return reward, optimiser, jax.tree.map(jnp.mean, metrics)
 
     def _loss(self, weights: Params, grounded: jax.Array, wanted: jax.Array, key: jax.Array):
         """Return -(E_grounded[log D] + E_target[log(1 - D)]) plus the gradient penalty, []."""
-        logits_grounded = self.network.apply(weights, grounded)
-        logits_target = self.network.apply(weights, wanted)
+        logits_grounded = forward(self.network, weights, grounded)
+        logits_target = forward(self.network, weights, wanted)
         loss = jnp.mean(jax.nn.softplus(-logits_grounded)) + jnp.mean(
             jax.nn.softplus(logits_target)
         )
         penalty = gradient_penalty(
-            lambda x: self.network.apply(weights, x), grounded, wanted, key
+            lambda x: forward(self.network, weights, x), grounded, wanted, key
         )
         accuracy = (jnp.mean(logits_grounded > 0) + jnp.mean(logits_target < 0)) / 2
         return loss + self.config.gradient_penalty * penalty, {

@@ -53,9 +53,7 @@ class GroundedEnv(Env):
     ) -> StepResult:
         """Step the environment with the transformed action."""
         transform_key, key = jax.random.split(key)
-        action = self.transform(
-            params.transformer, state.obs, self.env.clip(action), transform_key
-        )
+        action = self.transform(params.transformer, state.obs, self.env.clip(action), transform_key)
         return self.env.step(params.env, state, action, key)
 
 
@@ -144,7 +142,7 @@ def decode_action(
     middle = (env.action_high + env.action_low) / 2
 
     def decode(action: jax.Array, output: jax.Array) -> jax.Array:
-        origin = action if output_is == "change" else middle
+        origin = action if output_is == "change" else jnp.asarray(middle, action.dtype)
         return env.clip(origin + reach * half_range * jnp.clip(output, -1, 1))
 
     return decode

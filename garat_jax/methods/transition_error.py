@@ -1,0 +1,33 @@
+"""How far a source is from the target, one step at a time: no policy, no learning in it."""
+
+import jax
+import jax.numpy as jnp
+
+from garat_jax import rollout
+from garat_jax.env import Env
+from garat_jax.rollout import Recorded
+from garat_jax.types import Params
+
+CONSTANT_ACTIONS = 21
+"""Constant actions that the constant baseline tries, over the action's range."""
+
+
+def transition_error(env: Env, params: Params, recorded: Recorded) -> jax.Array:
+    """Return the mean L2 error of next observations, each step from the recorded state, []."""
+    # No environment that this is called with draws anything.
+    next_obs = rollout.replay(env, params, recorded, jax.random.key(0))
+    wanted = recorded.transitions.next_obs.reshape(next_obs.shape)
+    return jnp.mean(jnp.linalg.norm(next_obs - wanted, axis=-1))
+
+
+def constant_errors(env: Env, params: Params, recorded: Recorded) -> jax.Array:
+    """Return the transition error of each constant action over the range, [CONSTANT_ACTIONS]."""
+    fractions = jnp.linspace(0.0, 1.0, CONSTANT_ACTIONS)
+    actions = env.action_low + fractions[:, None] * (env.action_high - env.action_low)
+
+    def error(action: jax.Array) -> jax.Array:
+        transitions = recorded.transitions
+        fixed = transitions._replace(action=jnp.broadcast_to(action, transitions.action.shape))
+        return transition_error(env, params, recorded._replace(transitions=fixed))
+
+    return jax.lax.map(error, actions)

@@ -1,0 +1,281 @@
+"""What a transfer experiment found: `summary.json` and the report. No JAX."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+
+from garat_jax import report
+from garat_jax.report import Fact, Figure, Section, Table
+from garat_jax.runs import RunDirectory, to_plain
+
+SOURCE_FRACTION = 0.3
+"""A seed is meaningful only if its source policy gets less than this share of the target's."""
+TARGET_FRACTION = 0.95
+"""And only if its target policy gets at least this share of what counts as solved."""
+CONTROLS = ("more_source_training", "action_noise")
+
+
+def summarise(
+    *,
+    pair: str,
+    method: str,
+    seeds: Sequence[int],
+    solved_return: float,
+    returns: Mapping[str, np.ndarray],
+    errors: Mapping[str, np.ndarray],
+    curve: Sequence[Mapping[str, Any]],
+    target_transitions: int,
+    env_steps: Mapping[str, np.ndarray],
+    seconds: Mapping[str, float],
+) -> dict[str, Any]:
+    """Return the content of `summary.json` (format "garat-transfer/1").
+
+    Args:
+        pair: The pair's name.
+        method: The method's name.
+        seeds: The seeds.
+        solved_return: Return from which the task counts as solved.
+        returns: Mean target returns [seeds] of `source_policy`, `target_policy`, `method` and the
+            controls.
+        errors: Held-out transition errors [seeds] of `source`, `grounded` and the baselines.
+        curve: The logged lines of the grounding.
+        target_transitions: How many target transitions the method saw.
+        env_steps: Environment steps by stage, [seeds].
+        seconds: Wall time spent compiling and running.
+    """
+    source, target = returns["source_policy"], returns["target_policy"]
+    solved = TARGET_FRACTION * solved_return
+    meaningful = (source < SOURCE_FRACTION * target) & (target >= solved)
+    scaled = {
+        name: scale(returns[name], source, target, meaningful) for name in ("method", *CONTROLS)
+    }
+    content = {
+        "format": "garat-transfer/1",
+        "pair": pair,
+        "method": method,
+        "seeds": seeds,
+        "returns": {name: returns[name] for name in ("source_policy", "target_policy", "method")},
+        "meaningful": meaningful,
+        "scaled": scaled["method"],
+        "controls": {name: {"returns": returns[name], "scaled": scaled[name]} for name in CONTROLS},
+        "transition_error": {name: errors[name] for name in ("source", "grounded", "zero_action")},
+        "error_ratio": errors["grounded"] / errors["source"],
+        "baselines": {
+            name: {"error": errors[name], "ratio": errors[name] / errors["source"]}
+            for name in ("zero_action", "constant_action")
+        },
+        "transition_error_curve": {
+            "update": [line["step"] for line in curve],
+            "grounded": [line["error"] for line in curve],
+        },
+        "target_transitions": target_transitions,
+        "env_steps": env_steps,
+        "seconds": seconds,
+    }
+    return to_plain(content)
+
+
+def scale(
+    returns: np.ndarray, source: np.ndarray, target: np.ndarray, meaningful: np.ndarray
+) -> dict[str, Any]:
+    """Scale returns so that the source policy is 0 and the target policy 1.
+
+    Args:
+        returns: Mean target returns, [seeds].
+        source: Those of the source policies, [seeds].
+        target: Those of the target policies, [seeds].
+        meaningful: Which seeds count; the others are None in `per_seed` and not averaged in.
+
+    Returns:
+        Mean, standard error of the mean (None where it cannot be had) and values per seed.
+    """
+    gap = np.where(meaningful, target - source, 1.0)
+    values = (returns - source) / gap
+    counted = values[meaningful]
+    spread = counted.std(ddof=1) / np.sqrt(len(counted)) if len(counted) > 1 else None
+    return {
+        "mean": counted.mean() if len(counted) else None,
+        "standard_error": spread,
+        "per_seed": [
+            float(value) if good else None for value, good in zip(values, meaningful, strict=True)
+        ],
+    }
+
+
+def write_report(run: RunDirectory, summary: Mapping[str, Any], difference: str) -> None:
+    """Write `report.html` for a summary; `difference` says how target and source differ."""
+    report.write(
+        run.path("report.html"),
+        title=f"{summary['pair']}: {summary['method']}",
+        lead=lead(summary),
+        facts=facts(summary),
+        sections=sections(summary, difference),
+        reproduce=report.Reproduce.from_config(run.read_json("config.json")),
+        kind="Transfer to another world",
+    )
+
+
+def lead(summary: Mapping[str, Any]) -> str:
+    """Say in one sentence what came out."""
+    mean = summary["scaled"]["mean"]
+    ratio = np.mean(summary["error_ratio"])
+    if mean is None:
+        return (
+            "No seed is meaningful: either the source policy already works in the target, or no "
+            "policy solved it. Nothing can be said about the method from this run."
+        )
+    return (
+        f"After grounding, the policy reaches {mean:.2f} of the way from the source policy (0) to "
+        f"a policy trained in the target (1), and one step of the grounded source is off by "
+        f"{ratio:.2f} times what one step of the source is."
+    )
+
+
+def facts(summary: Mapping[str, Any]) -> list[Fact]:
+    """Return the numbers to be seen first."""
+    scaled = {"method": summary["scaled"]} | {
+        name: summary["controls"][name]["scaled"] for name in CONTROLS
+    }
+    labels = {
+        "method": f"{summary['method']}, scaled return",
+        "more_source_training": "control: more source training",
+        "action_noise": "control: action noise only",
+    }
+    shown = [Fact(_with_error(scaled[name]), label) for name, label in labels.items()]
+    return [*shown, Fact(f"{np.mean(summary['error_ratio']):.2f}", "error, share of the source's")]
+
+
+def _with_error(scaled: Mapping[str, Any]) -> str:
+    if scaled["mean"] is None:
+        return "–"
+    if scaled["standard_error"] is None:
+        return f"{scaled['mean']:.2f}"
+    return f"{scaled['mean']:.2f} ± {scaled['standard_error']:.2f}"
+
+
+def sections(summary: Mapping[str, Any], difference: str) -> list[Section]:
+    """Return the report's sections; the demo's report takes them too."""
+    return [
+        Section(
+            "Does the policy transfer?",
+            f"The target is {difference}. A policy that solves the source fails there. "
+            f"{summary['method']} learns from {summary['target_transitions']} transitions of the "
+            "target how the source's actions must be changed so that it moves like the target; "
+            "the policy then trains on in that grounded source.\n\n"
+            "Two controls say whether grounding did the work: as much more training in the "
+            "ungrounded source, and the same training with noise on the actions.",
+            figures=[Figure(_returns_figure(summary), _returns_caption(summary))],
+            tables=[_returns_table(summary)],
+        ),
+        Section(
+            "Does the grounded source move like the target?",
+            "Each held-out step of the target is taken again in the source: same state, same "
+            "action, one step. The error is the distance between the two next observations (L2).",
+            figures=[
+                Figure(
+                    _error_figure(summary),
+                    "Mean error of one step over the adversarial updates, one line a seed. Dashed: "
+                    "the source as it is, and the source when every action is replaced by zero "
+                    "(means over seeds). A method below the zero line has learned more than to "
+                    "weaken the actions.",
+                )
+            ],
+        ),
+    ]
+
+
+def _bars(summary: Mapping[str, Any]) -> dict[str, list[float | None]]:
+    count = len(summary["seeds"])
+    return {
+        "source policy": [0.0] * count,
+        "more source training": summary["controls"]["more_source_training"]["scaled"]["per_seed"],
+        "action noise only": summary["controls"]["action_noise"]["scaled"]["per_seed"],
+        summary["method"]: summary["scaled"]["per_seed"],
+        "policy trained in the target": [1.0] * count,
+    }
+
+
+def _returns_figure(summary: Mapping[str, Any]) -> go.Figure:
+    figure = go.Figure()
+    for name, values in _bars(summary).items():
+        kept = [value for value in values if value is not None]
+        own = name == summary["method"]
+        figure.add_bar(
+            x=[name],
+            y=[float(np.mean(kept)) if kept else None],
+            marker_color=report.COLOURS[0] if own else "#c5ccd6",
+            showlegend=False,
+        )
+        figure.add_scatter(
+            x=[name] * len(kept),
+            y=kept,
+            mode="markers",
+            marker={"color": report.INK, "size": 6, "opacity": 0.6},
+            showlegend=False,
+        )
+    return report.styled(figure, yaxis_title="scaled return in the target")
+
+
+def _returns_caption(summary: Mapping[str, Any]) -> str:
+    left_out = [
+        str(seed)
+        for seed, good in zip(summary["seeds"], summary["meaningful"], strict=True)
+        if not good
+    ]
+    note = (
+        f" Seeds {', '.join(left_out)} are not meaningful and are left out: their source policy "
+        "already works in the target, or their target policy does not."
+        if left_out
+        else ""
+    )
+    return f"Mean over seeds (bars) and every seed (dots), 50 episodes each.{note}"
+
+
+def _returns_table(summary: Mapping[str, Any]) -> Table:
+    columns = {
+        "source policy": summary["returns"]["source_policy"],
+        "more source training": summary["controls"]["more_source_training"]["returns"],
+        "action noise only": summary["controls"]["action_noise"]["returns"],
+        summary["method"]: summary["returns"]["method"],
+        "target policy": summary["returns"]["target_policy"],
+    }
+    rows = [
+        [seed, *(round(values[i], 1) for values in columns.values()), "yes" if good else "no"]
+        for i, (seed, good) in enumerate(zip(summary["seeds"], summary["meaningful"], strict=True))
+    ]
+    return Table(
+        ["seed", *columns, "meaningful"], rows, "Mean return in the target, unscaled, by seed."
+    )
+
+
+def _error_figure(summary: Mapping[str, Any]) -> go.Figure:
+    figure = go.Figure()
+    curve = summary["transition_error_curve"]
+    values = np.asarray(curve["grounded"])
+    for i, seed in enumerate(summary["seeds"]):
+        figure.add_scatter(
+            x=curve["update"],
+            y=values[:, i] if values.size else [],
+            name=f"grounded, seed {seed}",
+            line={"color": report.COLOURS[0], "width": 1.5},
+            opacity=0.75,
+            showlegend=False,
+        )
+    labels = {"source": "source as it is", "zero_action": "zero action"}
+    for colour, (name, label) in zip(report.COLOURS[1:], labels.items(), strict=False):
+        mean = float(np.mean(summary["transition_error"][name]))
+        figure.add_hline(
+            y=mean,
+            line={"color": colour, "dash": "dash"},
+            annotation_text=label,
+            annotation_position="top right",
+        )
+    top = 1.15 * float(np.max([summary["transition_error"]["source"], *curve["grounded"]]))
+    return report.styled(
+        figure,
+        xaxis_title="adversarial update",
+        yaxis_title="error of one step",
+        yaxis_range=[0, top],
+    )

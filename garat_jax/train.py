@@ -1,0 +1,228 @@
+"""The one host loop: compile, step, evaluate, log, checkpoint, resume, and stop on NaN."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from garat_jax import checkpoint
+from garat_jax.dynamics import Dynamics
+from garat_jax.errors import DivergedError
+from garat_jax.runs import RunDirectory
+
+State = TypeVar("State")
+
+CHECKPOINT_SECONDS = 60.0
+REPORT_SECONDS = 5.0
+DEEP_CHAIN = 5
+"""Joints in a chain from which XLA's CPU fusion emitters slow MJX down; see docs/performance.md."""
+
+
+@dataclasses.dataclass
+class Seconds:
+    """Wall time so far.
+
+    Attributes:
+        compile: Spent tracing and compiling.
+        run: Spent stepping, logging and checkpointing.
+    """
+
+    compile: float = 0.0
+    run: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Trainer:
+    """What the stages of one run share.
+
+    Attributes:
+        run: Where metrics and checkpoints go.
+        seeds: The seeds, in the order of the leading axis of every state.
+        seconds: Wall time, added up over the stages.
+        console: Where progress goes.
+    """
+
+    run: RunDirectory
+    seeds: Sequence[int]
+    seconds: Seconds = dataclasses.field(default_factory=Seconds)
+    console: Console = dataclasses.field(default_factory=lambda: Console(stderr=True))
+
+    def train(
+        self,
+        stage: str,
+        step: Callable[[State, Any], tuple[State, dict[str, jax.Array]]],
+        state: State,
+        params: Any,
+        num_iterations: int,
+        options: dict[str, Any] | None = None,
+    ) -> State:
+        """Step a batch of learners until they have done `num_iterations`.
+
+        Metrics go to `metrics.jsonl`, one line an iteration. A checkpoint is written each minute,
+        at the end, and on an interrupt; a resumed run goes on from the newest.
+
+        Args:
+            stage: Name of this part of the run.
+            step: `(state, params) -> (state, metrics)`; metrics are [seeds], and an entry
+                `finished` that is true for all seeds ends the stage early.
+            state: Where to start, leading axis [seeds].
+            params: Passed on to every step.
+            num_iterations: How many steps.
+            options: XLA's compiler options.
+
+        Raises:
+            DivergedError: A state stopped being finite.
+        """
+        folder = self.run.path(f"checkpoints/{stage}")
+        first = 0
+        if self.run.resumed and (latest := checkpoint.latest_step(folder)) is not None:
+            state, first = checkpoint.restore(folder, state), latest
+            self.console.print(f"{stage}: going on after iteration {first}")
+        started = time.monotonic()
+        compiled = jax.jit(_with_finite(step), compiler_options=options)
+        compiled = compiled.lower(state, params).compile()
+        self.seconds.compile += time.monotonic() - started
+        started = time.monotonic()
+        try:
+            return self._loop(stage, compiled, state, params, first, num_iterations)
+        finally:
+            self.seconds.run += time.monotonic() - started
+
+    def _loop(self, stage, step, state, params, first: int, num_iterations: int):
+        folder = self.run.path(f"checkpoints/{stage}")
+        saved = reported = time.monotonic()
+        iteration = first
+        try:
+            for iteration in range(first, num_iterations):
+                new_state, metrics, finite = step(state, params)
+                metrics = {name: np.asarray(value) for name, value in metrics.items()}
+                if not np.asarray(finite).all():
+                    self._diverged(stage, iteration, state, new_state, np.asarray(finite))
+                state = new_state
+                self.run.log(iteration + 1, stage=stage, **metrics)
+                now = time.monotonic()
+                if now - reported > REPORT_SECONDS:
+                    reported = now
+                    self._report(stage, iteration + 1, num_iterations, metrics)
+                if now - saved > CHECKPOINT_SECONDS:
+                    saved = now
+                    checkpoint.save(folder, iteration + 1, state)
+                if "finished" in metrics and metrics["finished"].all():
+                    iteration, num_iterations = iteration + 1, iteration + 1
+                    break
+            else:
+                iteration = max(first, num_iterations)
+        except KeyboardInterrupt:
+            self._save(folder, iteration, state)
+            raise
+        self._save(folder, iteration, state)
+        self._report(stage, iteration, num_iterations, None)
+        return state
+
+    def _save(self, folder, iteration: int, state) -> None:
+        if iteration > (checkpoint.latest_step(folder) or 0):
+            checkpoint.save(folder, iteration, state)
+
+    def _report(self, stage: str, iteration: int, of: int, metrics) -> None:
+        line = f"{stage}: {iteration}/{of}"
+        if metrics is not None:
+            line += "".join(
+                f"  {name} {value.mean():.3g}"
+                for name, value in metrics.items()
+                if name in ("evaluation", "episode_length", "discriminator_accuracy", "error_ratio")
+            )
+        self.console.print(line, highlight=False)
+
+    def _diverged(self, stage: str, iteration: int, last, offending, finite: np.ndarray):
+        """Leave the last finite state and the offending one, and say where they are."""
+        self._save(self.run.path(f"checkpoints/{stage}"), iteration, last)
+        leaves = jax.tree_util.tree_flatten_with_path(offending)[0]
+        arrays = {
+            jax.tree_util.keystr(path): np.asarray(leaf)
+            for path, leaf in leaves
+            if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        }
+        path = self.run.path(f"diverged/{stage}-{iteration + 1}.npz")
+        np.savez_compressed(path, allow_pickle=False, **arrays)
+        bad = [seed for seed, good in zip(self.seeds, finite, strict=True) if not good]
+        raise DivergedError(
+            f"{stage}: seed {', '.join(map(str, bad))} stopped being finite at iteration "
+            f"{iteration + 1}; the last finite state is in checkpoints/{stage}, "
+            f"the offending one in {path}"
+        )
+
+
+def _with_finite(step):
+    """Add to a step's results whether each seed's float leaves are all finite, [seeds]."""
+
+    def stepped(state, params):
+        state, metrics = step(state, params)
+        finite = [
+            jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1)
+            for leaf in jax.tree.leaves((state, metrics))
+            if jnp.issubdtype(leaf.dtype, jnp.floating)
+        ]
+        return state, metrics, jnp.stack(finite).all(axis=0)
+
+    return stepped
+
+
+class UntilSolved(NamedTuple):
+    """A learner that stays as it is once it has solved its task."""
+
+    state: Any
+    solved: jax.Array
+    key: jax.Array
+
+
+def until_solved(step, evaluate, solved_return: float):
+    """Wrap a learner's step so that the learner stays as it is once it has solved its task.
+
+    Args:
+        step: `(state, params) -> (state, metrics, ...)` of one learner.
+        evaluate: `(state, params, key) -> mean return` of one learner.
+        solved_return: Mean return that counts as solved.
+
+    Returns:
+        `(UntilSolved, params) -> (UntilSolved, metrics)`.
+    """
+
+    def stepped(carry: UntilSolved, params):
+        state, solved, key = carry
+        new, metrics = step(state, params)[:2]
+        state = jax.tree.map(lambda old, n: jnp.where(solved, old, n), state, new)
+        key, evaluate_key = jax.random.split(key)
+        score = evaluate(state, params, evaluate_key)
+        solved = solved | (score >= solved_return)
+        metrics = metrics | {"evaluation": score, "finished": solved}
+        return UntilSolved(state, solved, key), metrics
+
+    return stepped
+
+
+def compiler_options(dynamics: Dynamics) -> dict[str, Any]:
+    """Return XLA's options for programs that step these dynamics.
+
+    XLA's CPU fusion emitters make MJX up to hundreds of times slower on deep kinematic chains
+    (github.com/jax-ml/jax/issues/33761) and shallow ones slightly faster. C MuJoCo is not touched
+    by them. What the user put in XLA_FLAGS stays as it is.
+    """
+    if dynamics.engine != "mjx" or jax.default_backend() != "cpu":
+        return {}
+    if chain_depth(dynamics) < DEEP_CHAIN:
+        return {}
+    return {"xla_cpu_use_fusion_emitters": False}
+
+
+def chain_depth(dynamics: Dynamics) -> int:
+    """Return the largest number of degrees of freedom between the world and a body."""
+    host = dynamics.host.model
+    depth = np.zeros(host.nbody, int)
+    for body in range(1, host.nbody):
+        depth[body] = depth[host.body_parentid[body]] + host.body_dofnum[body]
+    return int(depth.max())

@@ -1,0 +1,311 @@
+"""The transfer experiment: train in the source, ground it, retrain, evaluate in the target.
+
+Desai et al. 2020 (arXiv 2008.01594), algorithm 1, with every seed a row of one program. Beside
+the method stand two controls, which say whether grounding did the work: as much more training in
+the ungrounded source, and training with action noise alone.
+"""
+
+import dataclasses
+import zlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from garat_jax import rollout, summary, train
+from garat_jax.agents import trpo
+from garat_jax.agents.actor_critic import ActorCriticState, PolicyParams
+from garat_jax.agents.trpo import TRPOConfig
+from garat_jax.dynamics import Override
+from garat_jax.env import Env, Task, World, make_world
+from garat_jax.methods.garat import GARAT, GARATConfig, GARATState
+from garat_jax.methods.grounded import GroundedEnv, Grounding
+from garat_jax.methods.transition_error import constant_errors, transition_error
+from garat_jax.rollout import Recorded
+from garat_jax.runs import RunDirectory
+from garat_jax.train import Trainer, UntilSolved
+from garat_jax.types import Agent, Params
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """A source and a target world of one task.
+
+    Attributes:
+        name: Its name.
+        summary: One line that says what differs.
+        task: What both worlds ask of the agent.
+        source: Overrides that make the source.
+        target: Overrides that make the target.
+    """
+
+    name: str
+    summary: str
+    task: Task
+    source: tuple[Override, ...]
+    target: tuple[Override, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class TransferConfig:
+    """Settings of one transfer experiment; presets give tuned ones."""
+
+    pair: Pair
+    method: str
+    seeds: int = 5
+    engine: str = "auto"
+    agent: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
+    garat: GARATConfig = dataclasses.field(default_factory=GARATConfig)
+    max_iterations: int = 200  # of training a policy until it solves its world
+    num_updates: int = 50  # adversarial updates, Desai et al. 2020
+    num_retraining: int = 60  # iterations of the agent in the grounded source
+    num_target_transitions: int = 5000
+    action_noise: float = 0.135  # half-ranges: the transformer's initial standard deviation
+    num_episodes: int = 50  # Desai et al. 2020
+    num_solving_episodes: int = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Worlds:
+    """The two worlds and the agent that lives in them."""
+
+    source: World
+    target: World
+    agent: Agent
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """One run of the protocol.
+
+    Attributes:
+        config: Its settings.
+        trainer: Its host loop.
+        worlds: Its worlds and agent.
+        keys: One PRNG key a seed, [seeds].
+    """
+
+    config: TransferConfig
+    trainer: Trainer
+    worlds: Worlds
+    keys: jax.Array
+
+    def solve(self, stage: str, world: World) -> ActorCriticState:
+        """Train policies [seeds] from scratch until each solves a world."""
+        config, agent = self.config, self.worlds.agent
+
+        def evaluate(state: ActorCriticState, params: Params, key: jax.Array) -> jax.Array:
+            episodes = config.num_solving_episodes
+            returns = rollout.evaluate(world.env, params, agent.policy, state.policy, key, episodes)
+            return returns.mean()
+
+        def start(key: jax.Array) -> UntilSolved:
+            init_key, key = jax.random.split(key)
+            return UntilSolved(agent.init(init_key, world.params), jnp.zeros((), bool), key)
+
+        step = train.until_solved(agent.step, evaluate, config.pair.task.solved_return)
+        carry = self.train(
+            stage,
+            step,
+            self.map(start, _fold(self.keys, stage)),
+            world.params,
+            config.max_iterations,
+            world,
+        )
+        return carry.state
+
+    def retrain(self, stage: str, env: Env, params: Params, start: ActorCriticState, axes=None):
+        """Train policies [seeds] further in an environment; `axes` as `vmap`'s for `params`."""
+        agent = trpo.make(env, self.config.agent)
+
+        def move(state: ActorCriticState, key: jax.Array, params: Params) -> ActorCriticState:
+            num_envs = self.config.agent.num_envs
+            return state._replace(env=rollout.reset(env, params, key, num_envs), key=key)
+
+        keys = _fold(self.keys, stage)
+        state = jax.jit(jax.vmap(move, (0, 0, axes)))(start, keys, params)
+        return self.train(
+            stage,
+            lambda state, params: agent.step(state, params)[:2],
+            state,
+            params,
+            self.config.num_retraining,
+            self.worlds.source,
+            axes,
+        )
+
+    def train(self, stage: str, step, state, params, num_iterations: int, world: World, axes=None):
+        """Run a stage with one learner a seed."""
+        return self.trainer.train(
+            stage,
+            jax.vmap(step, in_axes=(0, axes)),
+            state,
+            params,
+            num_iterations,
+            train.compiler_options(world.params),
+        )
+
+    def map(self, function, *arguments) -> Any:
+        """Apply a function to the arguments of every seed."""
+        return jax.jit(jax.vmap(function))(*arguments)
+
+    def target_returns(self, policy: PolicyParams, stage: str) -> np.ndarray:
+        """Return the mean return of stochastic policies [seeds] in the target, [seeds]."""
+        target, agent = self.worlds.target, self.worlds.agent
+
+        def evaluate(policy: PolicyParams, key: jax.Array) -> jax.Array:
+            episodes = self.config.num_episodes
+            returns = rollout.evaluate(
+                target.env, target.params, agent.policy, policy, key, episodes
+            )
+            return returns.mean()
+
+        return np.asarray(self.map(evaluate, policy, _fold(self.keys, f"{stage} evaluation")))
+
+    def record(self, policy: PolicyParams, name: str) -> Recorded:
+        """Roll policies [seeds] out in the target: transitions and states, [seeds, T, B]."""
+        target, agent = self.worlds.target, self.worlds.agent
+        num_envs = self.config.agent.num_envs
+
+        def collect(policy: PolicyParams, key: jax.Array) -> Recorded:
+            length = self.config.num_target_transitions // num_envs
+            recorded = rollout.record(
+                target.env, target.params, agent.policy, policy, key, num_envs, length
+            )
+            transitions = recorded.transitions
+            executed = transitions._replace(action=target.env.clip(transitions.action))
+            return recorded._replace(transitions=executed)
+
+        return self.map(collect, policy, _fold(self.keys, name))
+
+    def ground(self, agent_policy: PolicyParams, recorded: Recorded, held_out: Recorded):
+        """Learn action transformers [seeds]; return the method and their final states."""
+        source, agent = self.worlds.source, self.worlds.agent
+        garat = GARAT(source.env, agent.policy, self.config.garat)
+        target = jax.tree.map(
+            lambda x: x.reshape(x.shape[0], x.shape[1] * x.shape[2], *x.shape[3:]),
+            recorded.transitions,
+        )
+        start = jax.jit(jax.vmap(garat.init, in_axes=(0, None, 0, 0)))(
+            _fold(self.keys, "grounding"), source.params, agent_policy, target
+        )
+
+        def step(state: GARATState, params):
+            env_params, agent_policy, target, held_out, source_error = params
+            state, metrics = garat.step(state, env_params, agent_policy, target)
+            grounding = Grounding(env_params, state.transformer.policy)
+            error = transition_error(garat.grounded, grounding, held_out)
+            return state, metrics | {"error": error, "error_ratio": error / source_error}
+
+        source_error = self.source_error(held_out)
+        params = (source.params, agent_policy, target, held_out, source_error)
+        axes = (None, 0, 0, 0, 0)
+        updates = self.config.num_updates
+        state = self.train("grounding", step, start, params, updates, source, axes)
+        return garat, state
+
+    def source_error(self, held_out: Recorded) -> jax.Array:
+        """Return the ungrounded source's transition error, [seeds]."""
+        source = self.worlds.source
+        return self.map(lambda data: transition_error(source.env, source.params, data), held_out)
+
+
+def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
+    """Run the experiment; write `summary.json` and return what is in it."""
+    task = config.pair.task
+    source = make_world(task, config.pair.source, engine=config.engine)
+    target = make_world(task, config.pair.target, engine=config.engine)
+    agent = trpo.make(source.env, config.agent)
+    trainer = Trainer(run, range(config.seeds))
+    keys = jax.vmap(jax.random.key)(jnp.arange(config.seeds))
+    experiment = Experiment(config, trainer, Worlds(source, target, agent), keys)
+
+    source_state = experiment.solve("source policy", source)
+    target_state = experiment.solve("target policy", target)
+    recorded = experiment.record(source_state.policy, "target transitions")
+    held_out = experiment.record(source_state.policy, "held-out transitions")
+    garat, grounding = experiment.ground(source_state.policy, recorded, held_out)
+
+    transformer = grounding.transformer.policy
+    axes = Grounding(None, 0)
+    grounded_state = experiment.retrain(
+        "grounded policy", garat.grounded, Grounding(source.params, transformer), source_state, axes
+    )
+    more_state = experiment.retrain("more source training", source.env, source.params, source_state)
+    noisy = GroundedEnv(source.env, _action_noise(source.env, config.action_noise))
+    noise_state = experiment.retrain(
+        "action noise", noisy, Grounding(source.params, ()), source_state
+    )
+    states = {
+        "source_policy": source_state,
+        "target_policy": target_state,
+        "method": grounded_state,
+        "more_source_training": more_state,
+        "action_noise": noise_state,
+    }
+    returns = {
+        name: experiment.target_returns(state.policy, name) for name, state in states.items()
+    }
+    errors = _errors(experiment, garat, transformer, recorded, held_out)
+    result = summary.summarise(
+        pair=config.pair.name,
+        method=config.method,
+        seeds=list(trainer.seeds),
+        solved_return=task.solved_return,
+        returns=returns,
+        errors=errors,
+        curve=[line for line in run.metrics() if line["stage"] == "grounding"],
+        target_transitions=config.num_target_transitions,
+        env_steps={
+            name: np.asarray(state.env_steps)
+            for name, state in (states | {"grounding": grounding.transformer}).items()
+        },
+        seconds=dataclasses.asdict(trainer.seconds),
+    )
+    run.write_json("summary.json", result)
+    summary.write_report(run, result, config.pair.summary)
+    return result
+
+
+def _fold(keys: jax.Array, name: str) -> jax.Array:
+    """Return keys [seeds] for a named purpose."""
+    number = zlib.crc32(name.encode())
+    return jax.vmap(lambda key: jax.random.fold_in(key, number))(keys)
+
+
+def _action_noise(env: Env, scale: float):
+    half_range = (env.action_high - env.action_low) / 2
+
+    def transform(params: Params, obs: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
+        del params, obs
+        return action + scale * half_range * jax.random.normal(key, action.shape)
+
+    return transform
+
+
+def _errors(
+    experiment: Experiment,
+    garat: GARAT,
+    transformer: PolicyParams,
+    recorded: Recorded,
+    held_out: Recorded,
+) -> dict[str, np.ndarray]:
+    """Return held-out transition errors [seeds] of source, grounded source and baselines."""
+    source = experiment.worlds.source
+
+    def errors(transformer: PolicyParams, recorded: Recorded, held_out: Recorded):
+        best = jnp.argmin(constant_errors(source.env, source.params, recorded))
+        transitions = held_out.transitions
+        still = transitions._replace(action=jnp.zeros_like(transitions.action))
+        grounding = Grounding(source.params, transformer)
+        return {
+            "source": transition_error(source.env, source.params, held_out),
+            "grounded": transition_error(garat.grounded, grounding, held_out),
+            "zero_action": transition_error(
+                source.env, source.params, held_out._replace(transitions=still)
+            ),
+            "constant_action": constant_errors(source.env, source.params, held_out)[best],
+        }
+
+    return jax.tree.map(np.asarray, experiment.map(errors, transformer, recorded, held_out))
