@@ -1,0 +1,172 @@
+"""Compare a model as it is with measurements: how large its error is, and where."""
+
+import dataclasses
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from garat_jax.diagnosis.diagnose import choose_horizon
+from garat_jax.diagnosis.fit import Problem, settle
+from garat_jax.diagnosis.localise import Place, localise, missing_torque
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model, load_model
+from garat_jax.diagnosis.rank import ABOVE_FLOOR, Floor, make_metric, noise_floor
+from garat_jax.diagnosis.replay import Replay, Size, replay_with
+from garat_jax.diagnosis.results import Errors
+from garat_jax.diagnosis.simulate import Simulator, choose_grid
+from garat_jax.provenance import versions
+from garat_jax.runs import RunDirectory, finite_or_null, to_plain
+
+FORMAT = "garat-compare/1"
+HORIZONS = (0.2, 0.5, 1.0, 2.0)
+"""Seconds over which errors are told, besides the horizon of the stated error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AtHorizon:
+    """The error over one horizon: as a whole, and by signal."""
+
+    seconds: float
+    error: float
+    per_signal: Mapping[str, Mapping[str, Any]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """The error of a model as it is; fields as in compare.json.
+
+    `error` is that of diagnosis.json with no effect added: `after` equals `before`.
+    """
+
+    model: str
+    data: tuple[str, ...]
+    versions: Mapping[str, str | None]
+    seconds: float
+    error: Errors
+    horizons: tuple[AtHorizon, ...]
+    where: tuple[Place, ...]
+
+    @property
+    def sentence(self) -> str:
+        """How large the error is, in one sentence."""
+        error = self.error
+        ratio = error.before / error.noise_floor
+        size = f"{100 * error.before:.2g} % of the signals' spread"
+        if ratio <= ABOVE_FLOOR:
+            return f"The model is near the sensors' noise: its error is {size}."
+        worst = [f"Most goes wrong at {p.signal}, {p.regime}." for p in self.where[:1]]
+        said = f"The model's error is {size}, {ratio:.2g} times what noise alone would make."
+        return " ".join([said, *worst])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of compare.json; what is not finite is null."""
+        return {"format": FORMAT, **finite_or_null(to_plain(self))}
+
+
+def compare(
+    model: Model,
+    recordings: Sequence[Recording],
+    say: Callable[[str], None] = lambda message: None,
+) -> Comparison:
+    """Measure the error of a model as it is.
+
+    Args:
+        model: The model.
+        recordings: What was measured.
+        say: Told what is being done.
+    """
+    started = time.monotonic()
+    host = model.compile(engine="mujoco").host.model
+    grid = choose_grid(recordings, host.opt.timestep)
+    simulator = Simulator(model, (), grid)
+    say("choosing the horizon")
+    stated, _ = choose_horizon(simulator, recordings, grid)
+    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
+    played = {}
+    for horizon in sorted({stated, *(h for h in HORIZONS if h <= longest)}):
+        say(f"predicting over {horizon:g} s")
+        played[horizon] = replay_with(simulator, recordings, grid, horizon)
+    floor = _noise_floor(simulator, Simulator(model, (), grid, 2), played[stated], grid)
+    return Comparison(
+        model=str(model.path),
+        data=tuple(r.name for r in recordings),
+        versions=versions(),
+        seconds=time.monotonic() - started,
+        error=_errors(played[stated], floor),
+        horizons=tuple(
+            AtHorizon(h, p.error(), {n: s._asdict() for n, s in p.sizes().items()})
+            for h, p in played.items()
+        ),
+        where=tuple(localise(missing_torque(host, recordings))),
+    )
+
+
+def run_compare(model: Path, data: Sequence[Path], run: RunDirectory) -> Comparison:
+    """Compare a model file with recordings; write compare.json and report.html into a run.
+
+    Raises:
+        UserError: A file cannot be read or does not fit the model.
+    """
+    from garat_jax.diagnosis.report import write_comparison
+
+    loaded = load_model(model)
+    recordings = read_recordings(loaded, data)
+    comparison = compare(loaded, recordings, tell)
+    run.write_json("compare.json", comparison.to_json())
+    write_comparison(run, comparison, loaded, recordings)
+    return comparison
+
+
+def read_recordings(model: Model, paths: Sequence[Path]) -> list[Recording]:
+    """Read recordings of a model and tell their warnings."""
+    host = model.compile(engine="mujoco").host.model
+    recordings = [Recording.read(path, host) for path in paths]
+    for recording in recordings:
+        for warning in recording.warnings:
+            tell(f"warning: {warning}")
+    return recordings
+
+
+def tell(message: str) -> None:
+    """Write a line of progress on stderr."""
+    sys.stderr.write(f"{message}\n")
+
+
+def _noise_floor(simulator: Simulator, finer: Simulator, played: Replay, grid) -> Floor:
+    segments = played.segments
+    nothing = np.zeros(len(segments.start), bool)
+    problem = Problem(simulator, finer, segments, nothing, grid.interval * grid.per_sample)
+    settled = settle(problem, simulator.base, segments.start)
+    return noise_floor(problem, make_metric(problem), settled)
+
+
+def _errors(played: Replay, floor: Floor) -> Errors:
+    error, sizes = played.error(), played.sizes()
+    rest = np.sqrt(max(error**2 - floor.error**2, 0.0))
+    return Errors(
+        metric="root mean square of prediction error by signal's standard deviation, all "
+        f"recordings, segments of {played.horizon:g} s",
+        unit="1",
+        before=error,
+        after=error,
+        noise_floor=floor.error,
+        unexplained_share=float(rest / error) if error > 0 else 0.0,
+        per_signal={
+            name: _signal(size, float(by_noise))
+            for (name, size), by_noise in zip(sizes.items(), floor.by_signal, strict=True)
+        },
+    )
+
+
+def _signal(size: Size, floor_by_noise: float) -> dict[str, float | str]:
+    return {
+        "before": size.rmse,
+        "after": size.rmse,
+        "noise_floor": size.noise * floor_by_noise,
+        "fit_percent": size.fit_percent,
+        "unit": size.unit,
+    }

@@ -1,0 +1,145 @@
+"""Replay recordings with a model: what it predicts where each segment's initial state is free."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from garat_jax.diagnosis.fit import Problem, settle
+from garat_jax.diagnosis.measurements import Recording, estimate_velocity, signals
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.simulate import Segments, Simulator, choose_grid, cut
+
+
+class Size(NamedTuple):
+    """How far predictions of one signal are off.
+
+    Attributes:
+        rmse: Root mean square error, in the signal's unit.
+        relative: The same by the signal's standard deviation.
+        fit_percent: 100 (1 - |y - ŷ| / |y - mean y|), as in system identification.
+        noise: Standard deviation of the signal's noise.
+        unit: The signal's unit.
+    """
+
+    rmse: float
+    relative: float
+    fit_percent: float
+    noise: float
+    unit: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """A model's predictions beside the measurements.
+
+    Attributes:
+        horizon: Seconds of a segment.
+        names: Name of each signal.
+        units: Unit of each signal.
+        segments: The measurements, cut.
+        predicted: [S, L, num_signals].
+    """
+
+    horizon: float
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    segments: Segments
+    predicted: np.ndarray
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """Prediction minus measurement, 0 where there is no sample, [S, L, num_signals]."""
+        return (self.predicted - self.segments.measured) * self.segments.weight[..., None]
+
+    def sizes(self) -> dict[str, Size]:
+        """Return how far the predictions of each signal are off."""
+        found = {}
+        sampled = self.segments.weight > 0
+        deviation = self.deviation[sampled]
+        for i, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+            rmse = float(np.sqrt(np.mean(deviation[:, i] ** 2)))
+            relative = rmse / float(self.segments.spread[i])
+            noise = float(self.segments.noise[i])
+            found[name] = Size(rmse, relative, 100 * (1 - relative), noise, unit)
+        return found
+
+    def error(self) -> float:
+        """Return the root mean square over signals of the relative error."""
+        return float(np.sqrt(np.mean([size.relative**2 for size in self.sizes().values()])))
+
+    def worst(self, count: int) -> list[int]:
+        """Return the segments with the largest relative error, largest first."""
+        relative = self.deviation / self.segments.spread
+        samples = self.segments.weight.sum(axis=1)
+        return list(np.argsort(-(relative**2).sum(axis=(1, 2)) / samples)[:count])
+
+
+def replay(
+    model: Model, recordings: Sequence[Recording], horizons: Sequence[float]
+) -> tuple[Replay, ...]:
+    """Predict recordings over some horizons, the initial state of each segment fitted to it.
+
+    Args:
+        model: The model, with its effects.
+        recordings: What was measured.
+        horizons: Seconds of a segment.
+    """
+    timestep = model.compile(engine="mujoco").host.model.opt.timestep
+    grid = choose_grid(recordings, timestep)
+    simulator = Simulator(model, (), grid)
+    return tuple(replay_with(simulator, recordings, grid, horizon) for horizon in horizons)
+
+
+def replay_with(simulator: Simulator, recordings: Sequence[Recording], grid, horizon) -> Replay:
+    """Predict recordings with a simulator that is compiled already; see `replay`."""
+    segments = cut(recordings, grid, horizon)
+    sample = grid.interval * grid.per_sample
+    everywhere = np.ones(len(segments.start), bool)
+    problem = Problem(simulator, simulator, segments, everywhere, sample)
+    settled = settle(problem, simulator.base, segments.start)
+    residual = settled.residual.reshape(segments.measured.shape)
+    of_state = signals(simulator.host)[: segments.measured.shape[2]]
+    return Replay(
+        horizon=horizon,
+        names=tuple(s.name for s in of_state),
+        units=tuple(s.unit for s in of_state),
+        segments=segments,
+        predicted=segments.measured + residual * segments.noise,
+    )
+
+
+def as_recordings(
+    played: Replay, recordings: Sequence[Recording], model: mujoco.MjModel
+) -> list[Recording]:
+    """Put predictions in the place of the measurements, as if they had been recorded.
+
+    Whatever is then computed from both meets the same filters. Each segment is a span.
+    """
+    pieces: Mapping[int, list[int]] = {i: [] for i in range(len(recordings))}
+    for s, index in enumerate(played.segments.recording):
+        pieces[int(index)].append(s)
+    return [
+        _as_recording(played, recordings[index], members, model)
+        for index, members in pieces.items()
+        if members
+    ]
+
+
+def _as_recording(played: Replay, recording: Recording, members: list[int], model) -> Recording:
+    qpos, qvel = recording.qpos.copy(), recording.qvel.copy()
+    num_position = qpos.shape[1]
+    spans = []
+    for s in members:
+        count = int(played.segments.weight[s].sum())
+        first = int(played.segments.first[s])
+        at = slice(first, first + count)
+        qpos[at] = played.predicted[s, :count, :num_position]
+        if played.predicted.shape[2] > num_position:
+            qvel[at] = played.predicted[s, :count, num_position:]
+        else:
+            qvel[at] = estimate_velocity(model, recording.time[at], qpos[at])
+        spans.append((first, first + count))
+    return dataclasses.replace(recording, qpos=qpos, qvel=qvel, spans=tuple(spans))

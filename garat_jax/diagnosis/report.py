@@ -1,0 +1,374 @@
+"""The report of a diagnosis, and of a comparison, for a reader who was not there."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+
+from garat_jax import report
+from garat_jax.diagnosis import figures
+from garat_jax.diagnosis.figures import label, words
+from garat_jax.diagnosis.localise import MissingTorque, Place, missing_torque
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.replay import Replay, as_recordings, replay
+from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Estimate
+from garat_jax.effects import CATALOGUE
+from garat_jax.report import Fact, Figure, Reproduce, Section, Table
+from garat_jax.runs import RunDirectory
+
+if TYPE_CHECKING:
+    from garat_jax.diagnosis.compare import Comparison
+
+HORIZONS = (0.2, 0.5, 1.0, 2.0)
+"""Seconds over which errors are drawn."""
+NUM_WORST = 3
+"""Segments that are shaded as the worst."""
+NUM_SIGNALS = 4
+"""Signals that are drawn, those with the largest relative error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A model's predictions of the recordings, before and after it was repaired.
+
+    Attributes:
+        recordings: What was measured, those held out last.
+        before: Predictions of the model as it is, by horizon.
+        after: Predictions of the repaired model, by horizon; empty without a repair.
+        missing: The torque that the model lacks, from the measurements.
+        explained: The same from the repaired model's predictions.
+        host: The compiled model.
+    """
+
+    recordings: tuple[Recording, ...]
+    before: tuple[Replay, ...]
+    after: tuple[Replay, ...]
+    missing: MissingTorque
+    explained: MissingTorque | None
+    host: mujoco.MjModel
+
+    @property
+    def middle(self) -> int:
+        """Which horizon traces are drawn of: the longest up to half a second."""
+        usable = [i for i, played in enumerate(self.before) if played.horizon <= 0.5]
+        return usable[-1] if usable else 0
+
+
+def repaired(model: Model, selected: Sequence[Candidate]) -> Model:
+    """Return a model with the effects that a diagnosis found."""
+    effects = tuple(
+        CATALOGUE[c.effect](target=c.target, **{n: e.estimate for n, e in c.parameters.items()})
+        for c in selected
+    )
+    return dataclasses.replace(model, effects=(*model.effects, *effects))
+
+
+def look(model: Model, recordings: Sequence[Recording], selected: Sequence[Candidate] = ()) -> View:
+    """Simulate what the report shows.
+
+    Args:
+        model: The model as it was given.
+        recordings: What was measured, those held out last.
+        selected: The effects that a diagnosis found.
+    """
+    host = model.compile(engine="mujoco").host.model
+    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
+    horizons = [h for h in HORIZONS if h <= longest] or [longest]
+    before = replay(model, recordings, horizons)
+    after = replay(repaired(model, selected), recordings, horizons) if selected else ()
+    explained = None
+    if after:
+        as_measured = as_recordings(after[-1], recordings, host)
+        explained = missing_torque(host, as_measured)
+    missing = missing_torque(host, recordings)
+    return View(tuple(recordings), before, after, missing, explained, host)
+
+
+def write_diagnosis(
+    run: RunDirectory,
+    diagnosis: Diagnosis,
+    model: Model,
+    fitted: Sequence[Recording],
+    held_out: Sequence[Recording],
+) -> Path:
+    """Write report.html of a diagnosis into its run directory.
+
+    Args:
+        run: The run directory.
+        diagnosis: What was found.
+        model: The model as it was given.
+        fitted: The recordings that it was found with.
+        held_out: The recordings that it was proven on.
+    """
+    return report.write(
+        run.path("report.html"),
+        kind="What is missing in the model",
+        title=f"Diagnosis of {model.name}",
+        lead=diagnosis.sentence,
+        facts=diagnosis_facts(diagnosis),
+        sections=diagnosis_sections(diagnosis, model, fitted, held_out),
+        reproduce=Reproduce.from_config(run.read_json("config.json")),
+    )
+
+
+def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
+    """Return the numbers of a diagnosis to be seen first."""
+    error = diagnosis.error
+    return [
+        Fact(_percent(error.before), "error of the model as it is, of each signal's spread"),
+        Fact(_percent(error.after), "error with the effects that were found"),
+        Fact(_percent(error.noise_floor), "noise floor: no model can be better"),
+        Fact(_percent(error.unexplained_share), "of the error stays unexplained"),
+    ]
+
+
+def diagnosis_sections(
+    diagnosis: Diagnosis,
+    model: Model,
+    fitted: Sequence[Recording],
+    held_out: Sequence[Recording],
+) -> list[Section]:
+    """Return the sections of a diagnosis; see `write_diagnosis` for the arguments."""
+    view = look(model, (*fitted, *held_out), diagnosis.selected)
+    shown = range(len(fitted), len(view.recordings))
+    return [
+        _errors(diagnosis.error, view),
+        _traces(view, shown),
+        *_where(diagnosis.where, view),
+        *_ranking(diagnosis),
+        *_ladder(diagnosis),
+        *_parameters(diagnosis),
+        *_next(diagnosis),
+    ]
+
+
+def write_comparison(
+    run: RunDirectory,
+    comparison: "Comparison",
+    model: Model,
+    recordings: Sequence[Recording],
+) -> Path:
+    """Write report.html of a comparison into its run directory."""
+    error, view = comparison.error, look(model, recordings)
+    facts = [
+        Fact(_percent(error.before), "error, of each signal's spread"),
+        Fact(_percent(error.noise_floor), "noise floor: no model can be better"),
+        Fact(str(len(recordings)), "recordings"),
+    ]
+    everything = range(len(recordings))
+    return report.write(
+        run.path("report.html"),
+        kind="A model against measurements",
+        title=f"Comparison of {model.name}",
+        lead=comparison.sentence,
+        facts=facts,
+        sections=[
+            _errors(error, view),
+            _traces(view, everything),
+            *_where(comparison.where, view),
+        ],
+        reproduce=Reproduce.from_config(run.read_json("config.json")),
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
+
+
+def _errors(error: Errors, view: View) -> Section:
+    stated = [
+        (
+            name,
+            row["unit"],
+            row["before"],
+            *([row["after"]] if view.after else []),
+            row["noise_floor"],
+        )
+        for name, row in error.per_signal.items()
+    ]
+    columns = ["signal", "unit", "model as it is", *(["repaired"] if view.after else []), "noise"]
+    by_horizon = [
+        (name, size.unit, *(p.sizes()[name].rmse for p in played))
+        for name, size in view.before[0].sizes().items()
+        for played in [view.after or view.before]
+    ]
+    which = "repaired model" if view.after else "model as it is"
+    return Section(
+        "How far the model is off",
+        "The recordings are cut into short segments. The model starts each one from the state that "
+        "fits the segment best and is given the recorded commands; what it then predicts is "
+        "compared with what was measured. An error of 1 is as bad as always predicting the "
+        f"signal's mean.\n\nThe error stated in this report is the {error.metric}.",
+        figures=[
+            Figure(
+                figures.errors_by_horizon(view.before, view.after, error.noise_floor),
+                "Error over all recordings against how far ahead is predicted. At the dotted line "
+                "the sensors' noise alone is left.",
+                "Error by horizon",
+            )
+        ],
+        tables=[
+            Table(columns, stated, "Root mean square error of each signal, in its own unit."),
+            Table(
+                ["signal", "unit", *(f"{p.horizon:g} s" for p in view.before)],
+                by_horizon,
+                f"Root mean square error of the {which} by horizon, over all recordings.",
+            ),
+        ],
+    )
+
+
+def _traces(view: View, candidates: Sequence[int]) -> Section:
+    before = view.before[view.middle]
+    after = view.after[view.middle] if view.after else None
+    order = before.worst(len(before.segments.first))
+    order = [s for s in order if before.segments.recording[s] in candidates]
+    index = int(before.segments.recording[order[0]])
+    recording = view.recordings[index]
+    worst = [s for s in order if before.segments.recording[s] == index][:NUM_WORST]
+    sizes = [size.relative for size in before.sizes().values()]
+    chosen = sorted(np.argsort(sizes)[::-1][:NUM_SIGNALS])
+    seconds = before.horizon
+    drawn = [
+        Figure(
+            figures.traces(recording, index, int(i), before, after, worst),
+            f"Above, {before.names[i]} as measured in {recording.name} and as simulated; every "
+            f"{seconds:g} s the simulation starts anew. Below, simulated minus measured. Shaded: "
+            f"the {len(worst)} segments in which the model as it is does worst.",
+            before.names[i],
+        )
+        for i in chosen
+    ]
+    held = "Of the recordings that were held out, this is" if view.after else "This is"
+    text = f"{held} {recording.name}, in which the model as it is does worst."
+    return Section("Measured against simulated", text, figures=drawn)
+
+
+def _where(places: Sequence[Place], view: View) -> list[Section]:
+    if not places:
+        return []
+    dof = view.missing.dofs.index(places[0].signal)
+    joint = int(view.host.dof_jntid[dof])
+    unit = "m" if view.host.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+    law = ""
+    if view.explained is not None:
+        law = " The line is what the repaired model gives by the same computation."
+    evidence = "\n".join(f"- {place.evidence}" for place in places[:6])
+    return [
+        Section(
+            "Where it fails",
+            "Inverse dynamics tells the torque that the measured motion took; what the model's "
+            "actuators did not give is missing. The shares say how well one simple pattern "
+            "fits the missing torque; patterns overlap, so they do not add up to 100 %."
+            f"\n\n{evidence}",
+            figures=[
+                Figure(
+                    figures.where_it_fails(places),
+                    "The longest bar is the pattern that the missing torque follows most closely.",
+                    "What the missing torque goes with",
+                )
+            ],
+        ),
+        Section(
+            f"The missing torque at {places[0].signal}",
+            "The shape of this cloud tells effects apart: a step at zero velocity is dry friction, "
+            "a slope is viscous friction, a level is an offset, a slope against the command is a "
+            f"wrong gain.{law}",
+            figures=[
+                Figure(
+                    figures.missing_torques(view.missing, view.explained, dof, unit),
+                    "Grey: every sample. Black: their mean in bins that hold equally many."
+                    + (" Blue: the effects that were found." if law else ""),
+                )
+            ],
+        ),
+    ]
+
+
+def _ranking(diagnosis: Diagnosis) -> list[Section]:
+    if not diagnosis.candidates:
+        return []
+    rows = [
+        (
+            label(c),
+            "; ".join(_estimate(name, e) for name, e in c.parameters.items()),
+            100 * c.share,
+            c.error_after,
+            100 * c.stability if np.isfinite(c.error_after) else None,
+            ", ".join(f"{words(n.effect)} at {n.target}" for n in c.indistinguishable_from),
+            c.why,
+        )
+        for c in diagnosis.candidates
+    ]
+    columns = ["effect", "size", "share [%]", "error", "stable [%]", "looks like", "verdict"]
+    drawn = []
+    if any(np.isfinite(c.held_out_gain.estimate) for c in diagnosis.candidates):
+        drawn.append(
+            Figure(
+                figures.ranking(diagnosis.candidates),
+                "How much the error on held-out recordings falls if this effect alone is added and "
+                "fitted. Green: it passes every test. Grey: it does not, see the table.",
+                "What each effect would explain",
+            )
+        )
+    return [
+        Section(
+            "Which effects could explain it",
+            "Every effect of the catalogue was tried at every place of the model. Only one that "
+            "explains much, that makes the error fall on recordings it was not fitted to, that "
+            "leads over all others for certain and that has a possible sign is added.",
+            figures=drawn,
+            tables=[
+                Table(
+                    columns,
+                    rows,
+                    "Share: of the fitted recordings' squared error that it explains. Error: on "
+                    "held-out recordings once it is fitted; effects without one were ruled out "
+                    "before. Stable: how often it, or one that looks like it, comes out first when "
+                    "the recordings are resampled. Looks like: effects that these recordings "
+                    "cannot tell from it.",
+                )
+            ],
+        )
+    ]
+
+
+def _ladder(diagnosis: Diagnosis) -> list[Section]:
+    if len(diagnosis.ladder) < 2:
+        return []
+    text = "Each step adds one effect and fits all of them again to the recordings fitted."
+    caption = "The error after each step. Only the blue line, on held-out recordings, is proof."
+    return [Section("The error falls", text, figures=[Figure(figures.ladder(diagnosis), caption)])]
+
+
+def _parameters(diagnosis: Diagnosis) -> list[Section]:
+    if not diagnosis.selected:
+        return []
+    rows = [
+        (label(c), name, e.estimate, e.low, e.high, e.unit)
+        for c in diagnosis.selected
+        for name, e in c.parameters.items()
+    ]
+    laws = "\n".join(f"- {words(c.effect)}: {CATALOGUE[c.effect].law}" for c in diagnosis.selected)
+    columns = ["effect", "parameter", "estimate", "low", "high", "unit"]
+    caption = "Estimates and their 95 % intervals; – where the recordings say nothing."
+    return [Section("What was added", laws, tables=[Table(columns, rows, caption)])]
+
+
+def _next(diagnosis: Diagnosis) -> list[Section]:
+    experiment = diagnosis.next_experiment
+    if experiment is None:
+        return []
+    names = " and ".join(f"{words(n.effect)} at {n.target}" for n in experiment.separates)
+    text = f"These recordings cannot tell {names} apart.\n\n{experiment.how}"
+    return [Section("What to record next", text)]
+
+
+def _estimate(name: str, e: Estimate) -> str:
+    ends = f" ({e.low:.3g} to {e.high:.3g})" if np.isfinite([e.low, e.high]).all() else ""
+    unit = f" {e.unit}" if e.unit not in ("", "1") else ""
+    return f"{name} {e.estimate:.3g}{ends}{unit}"
