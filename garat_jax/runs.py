@@ -145,9 +145,18 @@ class RunDirectory:
                 if line.endswith("\n"):
                     yield json.loads(line)
 
-    def rewind(self, step: int) -> None:
-        """Drop the metrics logged after `step`, so that a resumed run repeats none of them."""
-        kept = [line for line in self.metrics() if line["step"] <= step]
+    def rewind(self, step: int, stage: str | None = None) -> None:
+        """Drop the metrics logged after `step`, so that a resumed run repeats none of them.
+
+        Args:
+            step: The last step that stays.
+            stage: Drop only lines whose metric `stage` is this.
+        """
+
+        def stays(line: dict[str, Any]) -> bool:
+            return line["step"] <= step or (stage is not None and line.get("stage") != stage)
+
+        kept = [line for line in self.metrics() if stays(line)]
         _write_whole(self.path(METRICS), "".join(json.dumps(line) + "\n" for line in kept))
 
 

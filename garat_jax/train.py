@@ -82,47 +82,60 @@ class Trainer:
         first = 0
         if self.run.resumed and (latest := checkpoint.latest_step(folder)) is not None:
             state, first = checkpoint.restore(folder, state), latest
-            self.console.print(f"{stage}: going on after iteration {first}")
-        started = time.monotonic()
-        compiled = jax.jit(_with_finite(step), compiler_options=options)
-        compiled = compiled.lower(state, params).compile()
-        self.seconds.compile += time.monotonic() - started
+            self.run.rewind(first, stage)
+            self.console.print(f"{stage}: restored after iteration {first}", highlight=False)
+        if (self.run.root / _done(stage)).exists():
+            return state
+        compiled = self._compile(_with_finite(step), (state, params), options)
         started = time.monotonic()
         try:
             return self._loop(stage, compiled, state, params, first, num_iterations)
         finally:
             self.seconds.run += time.monotonic() - started
 
+    def call(self, function: Callable, *arguments: Any, options: dict[str, Any] | None = None):
+        """Compile a function, call it once, and return its result when it is there."""
+        compiled = self._compile(function, arguments, options)
+        started = time.monotonic()
+        result = jax.block_until_ready(compiled(*arguments))
+        self.seconds.run += time.monotonic() - started
+        return result
+
+    def _compile(self, function: Callable, arguments: tuple, options: dict[str, Any] | None):
+        started = time.monotonic()
+        compiled = jax.jit(function, compiler_options=options).lower(*arguments).compile()
+        self.seconds.compile += time.monotonic() - started
+        return compiled
+
     def _loop(self, stage, step, state, params, first: int, num_iterations: int):
         folder = self.run.path(f"checkpoints/{stage}")
         saved = reported = time.monotonic()
-        iteration = first
+        progress = (first, state)  # one name, so that an interrupt never parts the two
         try:
-            for iteration in range(first, num_iterations):
-                new_state, metrics, finite = step(state, params)
+            while progress[0] < num_iterations:
+                iteration, last = progress[0] + 1, progress[1]
+                new, metrics, finite = step(last, params)
                 metrics = {name: np.asarray(value) for name, value in metrics.items()}
                 if not np.asarray(finite).all():
-                    self._diverged(stage, iteration, state, new_state, np.asarray(finite))
-                state = new_state
-                self.run.log(iteration + 1, stage=stage, **metrics)
+                    self._diverged(stage, iteration, last, new, np.asarray(finite))
+                self.run.log(iteration, stage=stage, **metrics)
+                progress = (iteration, new)
                 now = time.monotonic()
                 if now - reported > REPORT_SECONDS:
                     reported = now
-                    self._report(stage, iteration + 1, num_iterations, metrics)
+                    self._report(stage, iteration, num_iterations, metrics)
                 if now - saved > CHECKPOINT_SECONDS:
                     saved = now
-                    checkpoint.save(folder, iteration + 1, state)
+                    self._save(folder, *progress)
                 if "finished" in metrics and metrics["finished"].all():
-                    iteration, num_iterations = iteration + 1, iteration + 1
                     break
-            else:
-                iteration = max(first, num_iterations)
         except KeyboardInterrupt:
-            self._save(folder, iteration, state)
+            self._save(folder, *progress)
             raise
-        self._save(folder, iteration, state)
-        self._report(stage, iteration, num_iterations, None)
-        return state
+        self._save(folder, *progress)
+        self.run.write_json(_done(stage), {"iterations": progress[0]})
+        self._report(stage, progress[0], progress[0], None)
+        return progress[1]
 
     def _save(self, folder, iteration: int, state) -> None:
         if iteration > (checkpoint.latest_step(folder) or 0):
@@ -140,21 +153,26 @@ class Trainer:
 
     def _diverged(self, stage: str, iteration: int, last, offending, finite: np.ndarray):
         """Leave the last finite state and the offending one, and say where they are."""
-        self._save(self.run.path(f"checkpoints/{stage}"), iteration, last)
+        self._save(self.run.path(f"checkpoints/{stage}"), iteration - 1, last)
         leaves = jax.tree_util.tree_flatten_with_path(offending)[0]
         arrays = {
             jax.tree_util.keystr(path): np.asarray(leaf)
             for path, leaf in leaves
             if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         }
-        path = self.run.path(f"diverged/{stage}-{iteration + 1}.npz")
+        path = self.run.path(f"diverged/{stage}-{iteration}.npz")
         np.savez_compressed(path, allow_pickle=False, **arrays)
         bad = [seed for seed, good in zip(self.seeds, finite, strict=True) if not good]
         raise DivergedError(
             f"{stage}: seed {', '.join(map(str, bad))} stopped being finite at iteration "
-            f"{iteration + 1}; the last finite state is in checkpoints/{stage}, "
+            f"{iteration}; the last finite state is in checkpoints/{stage}, "
             f"the offending one in {path}"
         )
+
+
+def _done(stage: str) -> str:
+    """Return the file that says that a stage is over."""
+    return f"stages/{stage}.json"
 
 
 def _with_finite(step):

@@ -54,6 +54,7 @@ class TransferConfig:
     pair: Pair
     method: str
     seeds: int = 5
+    first_seed: int = 0
     engine: str = "auto"
     agent: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
     garat: GARATConfig = dataclasses.field(default_factory=GARATConfig)
@@ -124,7 +125,7 @@ class Experiment:
             return state._replace(env=rollout.reset(env, params, key, num_envs), key=key)
 
         keys = _fold(self.keys, stage)
-        state = jax.jit(jax.vmap(move, (0, 0, axes)))(start, keys, params)
+        state = self.map(move, start, keys, params, axes=(0, 0, axes))
         return self.train(
             stage,
             lambda state, params: agent.step(state, params)[:2],
@@ -146,9 +147,10 @@ class Experiment:
             train.compiler_options(world.params),
         )
 
-    def map(self, function, *arguments) -> Any:
-        """Apply a function to the arguments of every seed."""
-        return jax.jit(jax.vmap(function))(*arguments)
+    def map(self, function, *arguments, axes: Any = 0) -> Any:
+        """Apply a function to the arguments of every seed; `axes` as `vmap`'s."""
+        options = train.compiler_options(self.worlds.source.params)
+        return self.trainer.call(jax.vmap(function, in_axes=axes), *arguments, options=options)
 
     def target_returns(self, policy: PolicyParams, stage: str) -> np.ndarray:
         """Return the mean return of stochastic policies [seeds] in the target, [seeds]."""
@@ -187,9 +189,8 @@ class Experiment:
             lambda x: x.reshape(x.shape[0], x.shape[1] * x.shape[2], *x.shape[3:]),
             recorded.transitions,
         )
-        start = jax.jit(jax.vmap(garat.init, in_axes=(0, None, 0, 0)))(
-            _fold(self.keys, "grounding"), source.params, agent_policy, target
-        )
+        arguments = (_fold(self.keys, "grounding"), source.params, agent_policy, target)
+        start = self.map(garat.init, *arguments, axes=(0, None, 0, 0))
 
         def step(state: GARATState, params):
             env_params, agent_policy, target, held_out, source_error = params
@@ -217,8 +218,8 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
     source = make_world(task, config.pair.source, engine=config.engine)
     target = make_world(task, config.pair.target, engine=config.engine)
     agent = trpo.make(source.env, config.agent)
-    trainer = Trainer(run, range(config.seeds))
-    keys = jax.vmap(jax.random.key)(jnp.arange(config.seeds))
+    trainer = Trainer(run, range(config.first_seed, config.first_seed + config.seeds))
+    keys = jax.vmap(jax.random.key)(jnp.asarray(trainer.seeds))
     experiment = Experiment(config, trainer, Worlds(source, target, agent), keys)
 
     source_state = experiment.solve("source policy", source)
