@@ -9,7 +9,7 @@ from garat_jax.transfer import Pair, TransferConfig
 
 def garat(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferConfig:
     """GARAT with the settings that docs/grounding.md measures best."""
-    return TransferConfig(pair, "garat", seeds, engine)
+    return TransferConfig(pair, "garat", seeds=seeds, engine=engine)
 
 
 def garat_paper(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferConfig:
@@ -20,7 +20,7 @@ def garat_paper(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferCon
         num_minibatches=1,
         centre_reward=False,
     )
-    return TransferConfig(pair, "garat_paper", seeds, engine, garat=settings)
+    return TransferConfig(pair, "garat_paper", seeds=seeds, engine=engine, garat=settings)
 
 
 METHODS: dict[str, Callable[..., TransferConfig]] = {
