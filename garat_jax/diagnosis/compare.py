@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from garat_jax.diagnosis.diagnose import choose_horizon
+from garat_jax.diagnosis.diagnose import choose_horizon, thin
 from garat_jax.diagnosis.fit import Problem, settle
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
@@ -80,6 +80,7 @@ def compare(
         say: Told what is being done.
     """
     started = time.monotonic()
+    recordings = thin(recordings)
     host = model.compile(engine="mujoco").host.model
     grid = choose_grid(recordings, host.opt.timestep)
     simulator = Simulator(model, (), grid)

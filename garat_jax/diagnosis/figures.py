@@ -18,6 +18,7 @@ MOST_POINTS = 1500
 """Points drawn of one line or cloud: enough to see, small enough for a phone."""
 BINS = 24
 """Bins of a binned mean."""
+ERROR = "error [% of the spread]"
 LINE_HEIGHT = 34
 """Pixels of one bar in a figure of bars."""
 
@@ -32,6 +33,11 @@ def label(candidate: Candidate) -> str:
     return f"{words(candidate.effect)} at {candidate.target}"
 
 
+def was_fitted(candidate: Candidate) -> bool:
+    """Say whether a candidate was fitted, not ruled out before."""
+    return bool(np.isfinite(candidate.error_after))
+
+
 def errors_by_horizon(before: Sequence[Replay], after: Sequence[Replay], floor: float) -> go.Figure:
     """Draw the error against the horizon, and the noise floor."""
     figure = go.Figure()
@@ -39,17 +45,17 @@ def errors_by_horizon(before: Sequence[Replay], after: Sequence[Replay], floor: 
         if played:
             figure.add_scatter(
                 x=[p.horizon for p in played],
-                y=[p.error() for p in played],
+                y=[100 * p.error() for p in played],
                 name=name,
                 mode="lines+markers",
                 line={"color": colour, "width": 2.5},
                 marker={"size": 8},
-                hovertemplate="%{x} s: %{y:.3g}",
+                hovertemplate="%{x} s: %{y:.3g} %",
             )
     figure = styled(figure, height=300)
     _floor(figure, floor)
     figure.update_xaxes(title_text="horizon of the prediction [s]", rangemode="tozero")
-    return figure.update_yaxes(title_text="error / spread of the signal", rangemode="tozero")
+    return figure.update_yaxes(title_text=ERROR, rangemode="tozero")
 
 
 def traces(
@@ -141,7 +147,7 @@ def missing_torques(
     figure = make_subplots(len(axes), 1, vertical_spacing=0.28 / len(axes))
     step = max(1, len(measured.time) // MOST_POINTS)
     for row, (field, title) in enumerate(axes, start=1):
-        x, y = getattr(measured, field)[:, dof], measured.torque[:, dof]
+        x, y = _abscissa(measured, field, dof, unit), measured.torque[:, dof]
         figure.add_scatter(
             x=x[::step],
             y=y[::step],
@@ -156,7 +162,7 @@ def missing_torques(
         edges = np.unique(np.quantile(x, np.linspace(0, 1, BINS + 1)))
         means = {"measured, mean": (x, y, MEASURED, "markers")}
         if explained is not None:
-            of_law = getattr(explained, field)[:, dof], explained.torque[:, dof]
+            of_law = _abscissa(explained, field, dof, unit), explained.torque[:, dof]
             means["law found, mean"] = (*of_law, AFTER, "lines")
         for name, (at, torque, colour, mode) in means.items():
             centre, mean = _binned(at, torque, edges)
@@ -181,12 +187,12 @@ def missing_torques(
 
 def ranking(candidates: Sequence[Candidate]) -> go.Figure:
     """Draw by how much each fitted candidate makes the held-out error fall, with its interval."""
-    shown = [c for c in candidates if np.isfinite(c.held_out_gain.estimate)][::-1]
+    shown = [c for c in candidates if was_fitted(c)][::-1]
     gains = [c.held_out_gain for c in shown]
     colours = [GOOD if c.passes else FAINT for c in shown]
     figure = go.Figure(
         go.Scatter(
-            x=[g.estimate for g in gains],
+            x=[100 * g.estimate for g in gains],
             y=[label(c) for c in shown],
             mode="markers",
             marker={"color": colours, "size": 11},
@@ -195,7 +201,7 @@ def ranking(candidates: Sequence[Candidate]) -> go.Figure:
     )
     for candidate, gain, colour in zip(shown, gains, colours, strict=True):
         figure.add_scatter(
-            x=[gain.low, gain.high],
+            x=[100 * gain.low, 100 * gain.high],
             y=[label(candidate)] * 2,
             mode="lines",
             line={"color": colour, "width": 3},
@@ -203,7 +209,7 @@ def ranking(candidates: Sequence[Candidate]) -> go.Figure:
         )
     figure = styled(figure, height=100 + LINE_HEIGHT * len(shown), showlegend=False)
     figure.add_vline(0, line={"color": SOFT, "width": 1})
-    return figure.update_xaxes(title_text="fall of the held-out error, with 95 % interval")
+    return figure.update_xaxes(title_text="fall of the held-out error [% of the spread]")
 
 
 def ladder(diagnosis: Diagnosis) -> go.Figure:
@@ -211,8 +217,8 @@ def ladder(diagnosis: Diagnosis) -> go.Figure:
     names = [f"+ {label(r.added)}" if r.added else "model as it is" for r in diagnosis.ladder]
     figure = go.Figure()
     for name, errors, colour in (
-        ("recordings fitted", [r.error_fit for r in diagnosis.ladder], FAINT),
-        ("recordings held out", [r.error_holdout for r in diagnosis.ladder], AFTER),
+        ("recordings fitted", [100 * r.error_fit for r in diagnosis.ladder], FAINT),
+        ("recordings held out", [100 * r.error_holdout for r in diagnosis.ladder], AFTER),
     ):
         figure.add_scatter(
             x=names,
@@ -221,19 +227,19 @@ def ladder(diagnosis: Diagnosis) -> go.Figure:
             mode="lines+markers",
             line={"color": colour, "width": 2.5},
             marker={"size": 9},
-            hovertemplate="%{y:.3g}",
+            hovertemplate="%{y:.3g} %",
         )
     figure = styled(figure, height=320)
     _floor(figure, diagnosis.error.noise_floor)
-    return figure.update_yaxes(title_text="error / spread of the signal", rangemode="tozero")
+    return figure.update_yaxes(title_text=ERROR, rangemode="tozero")
 
 
 def _floor(figure: go.Figure, floor: float) -> None:
     figure.add_hline(
-        floor,
+        100 * floor,
         line={"color": SOFT, "width": 1.5, "dash": "dot"},
         annotation={"text": "noise floor", "font": {"color": SOFT, "size": 12}},
-        annotation_position="top right",
+        annotation_position="top left",
     )
 
 
@@ -250,6 +256,14 @@ def _path(played: Replay, recording: Recording, index: int, signal: int):
         )
         parts.append([np.append(column[::step], np.nan) for column in columns])
     return tuple(np.concatenate(columns) for columns in zip(*parts, strict=True))
+
+
+def _abscissa(missing: MissingTorque, field: str, dof: int, unit: str) -> np.ndarray:
+    """Return a column of the missing torque; angles are taken within one turn."""
+    values = getattr(missing, field)[:, dof]
+    if field == "position" and unit == "rad" and np.ptp(values) > 2 * np.pi:
+        return (values + np.pi) % (2 * np.pi) - np.pi
+    return values
 
 
 def _binned(x: np.ndarray, y: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

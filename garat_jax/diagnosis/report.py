@@ -10,7 +10,8 @@ import numpy as np
 
 from garat_jax import report
 from garat_jax.diagnosis import figures
-from garat_jax.diagnosis.figures import label, words
+from garat_jax.diagnosis.diagnose import split, thin
+from garat_jax.diagnosis.figures import label, was_fitted, words
 from garat_jax.diagnosis.localise import MissingTorque, Place, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
@@ -75,6 +76,7 @@ def look(model: Model, recordings: Sequence[Recording], selected: Sequence[Candi
         recordings: What was measured, those held out last.
         selected: The effects that a diagnosis found.
     """
+    recordings = thin(recordings)
     host = model.compile(engine="mujoco").host.model
     longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
     horizons = [h for h in HORIZONS if h <= longest] or [longest]
@@ -85,15 +87,15 @@ def look(model: Model, recordings: Sequence[Recording], selected: Sequence[Candi
         as_measured = as_recordings(after[-1], recordings, host)
         explained = missing_torque(host, as_measured)
     missing = missing_torque(host, recordings)
-    return View(tuple(recordings), before, after, missing, explained, host)
+    return View(recordings, before, after, missing, explained, host)
 
 
 def write_diagnosis(
     run: RunDirectory,
     diagnosis: Diagnosis,
     model: Model,
-    fitted: Sequence[Recording],
-    held_out: Sequence[Recording],
+    recordings: Sequence[Recording],
+    holdout: Sequence[Recording] = (),
 ) -> Path:
     """Write report.html of a diagnosis into its run directory.
 
@@ -101,18 +103,40 @@ def write_diagnosis(
         run: The run directory.
         diagnosis: What was found.
         model: The model as it was given.
-        fitted: The recordings that it was found with.
-        held_out: The recordings that it was proven on.
+        recordings: The recordings that `diagnose` was given.
+        holdout: Those that it was given to hold out.
     """
     return report.write(
         run.path("report.html"),
         kind="What is missing in the model",
         title=f"Diagnosis of {model.name}",
-        lead=diagnosis.sentence,
+        lead=diagnosis_lead(diagnosis),
         facts=diagnosis_facts(diagnosis),
-        sections=diagnosis_sections(diagnosis, model, fitted, held_out),
+        sections=diagnosis_sections(diagnosis, model, recordings, holdout),
         reproduce=Reproduce.from_config(run.read_json("config.json")),
     )
+
+
+def diagnosis_lead(diagnosis: Diagnosis) -> str:
+    """Return the result in words for a reader who was not there."""
+    error = diagnosis.error
+    names = " and ".join(label(c) for c in diagnosis.selected)
+    floor = f"noise alone makes {_percent(error.noise_floor)}"
+    if diagnosis.verdict == "adequate":
+        return (
+            "The model is adequate: on recordings held out its error is "
+            f"{_percent(error.before)} of the signals' spread, and {floor}."
+        )
+    fall = (
+        f"the error on recordings held out falls from {_percent(error.before)} to "
+        f"{_percent(error.after)} of the signals' spread; {floor}"
+    )
+    if diagnosis.verdict == "missing_effect":
+        return f"The model lacks {names}. With it, {fall}."
+    rest = f"{_percent(error.unexplained_share)} of the error stays unexplained"
+    if names:
+        return f"The model lacks {names}, but that is not all. With it, {fall}: {rest}."
+    return f"Something is missing that no effect in the catalogue explains: {rest}."
 
 
 def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
@@ -129,10 +153,11 @@ def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
 def diagnosis_sections(
     diagnosis: Diagnosis,
     model: Model,
-    fitted: Sequence[Recording],
-    held_out: Sequence[Recording],
+    recordings: Sequence[Recording],
+    holdout: Sequence[Recording] = (),
 ) -> list[Section]:
     """Return the sections of a diagnosis; see `write_diagnosis` for the arguments."""
+    fitted, held_out, _ = split(recordings, holdout)
     view = look(model, (*fitted, *held_out), diagnosis.selected)
     shown = range(len(fitted), len(view.recordings))
     return [
@@ -201,8 +226,8 @@ def _errors(error: Errors, view: View) -> Section:
         "How far the model is off",
         "The recordings are cut into short segments. The model starts each one from the state that "
         "fits the segment best and is given the recorded commands; what it then predicts is "
-        "compared with what was measured. An error of 1 is as bad as always predicting the "
-        f"signal's mean.\n\nThe error stated in this report is the {error.metric}.",
+        "compared with what was measured. An error of 100 % of the spread is as bad as always "
+        f"predicting the signal's mean.\n\nThe error stated in this report is the {error.metric}.",
         figures=[
             Figure(
                 figures.errors_by_horizon(view.before, view.after, error.noise_floor),
@@ -295,23 +320,24 @@ def _ranking(diagnosis: Diagnosis) -> list[Section]:
     rows = [
         (
             label(c),
-            "; ".join(_estimate(name, e) for name, e in c.parameters.items()),
-            100 * c.share,
-            c.error_after,
-            100 * c.stability if np.isfinite(c.error_after) else None,
+            "; ".join(_estimate(name, e) for name, e in c.parameters.items() if was_fitted(c)),
+            round(100 * c.share),
+            100 * c.error_after if was_fitted(c) else None,
+            round(100 * c.stability) if was_fitted(c) else None,
             ", ".join(f"{words(n.effect)} at {n.target}" for n in c.indistinguishable_from),
             c.why,
         )
         for c in diagnosis.candidates
     ]
-    columns = ["effect", "size", "share [%]", "error", "stable [%]", "looks like", "verdict"]
+    columns = ["effect", "size", "share [%]", "error [%]", "stable [%]", "looks like", "verdict"]
     drawn = []
-    if any(np.isfinite(c.held_out_gain.estimate) for c in diagnosis.candidates):
+    if any(map(was_fitted, diagnosis.candidates)):
         drawn.append(
             Figure(
                 figures.ranking(diagnosis.candidates),
                 "How much the error on held-out recordings falls if this effect alone is added and "
-                "fitted. Green: it passes every test. Grey: it does not, see the table.",
+                "fitted, with its 95 % interval. Green: it passes every test. Grey: it does not; "
+                "the table says why.",
                 "What each effect would explain",
             )
         )
