@@ -8,7 +8,7 @@ import dataclasses
 import inspect
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
@@ -21,6 +21,7 @@ from garat_jax.commandline import PROGRAM, how_to_go_on, is_users_mistake, parse
 from garat_jax.errors import DivergedError, UserError, choose
 
 if TYPE_CHECKING:
+    from garat_jax.effects import Effect
     from garat_jax.runs import RunDirectory
 
 DESCRIPTION = "Ground a simulator in data, and find the physical effect that it is missing."
@@ -156,13 +157,29 @@ class Diagnose:
 
 @dataclasses.dataclass(frozen=True)
 class Effects:
-    """Print the catalogue of physical effects: law, parameters, units."""
+    """Print the catalogue of physical effects: law, parameters, units, what identifies them."""
+
+    effect: Annotated[Positional[str | None], arg(metavar="EFFECT")] = None
+    """Print all there is to know about one effect."""
 
     def run(self) -> None:
-        """Print the catalogue."""
+        """Print the catalogue, or one entry."""
         from garat_jax.effects import CATALOGUE
 
-        print_registry("effect", CATALOGUE)
+        if self.effect is not None:
+            print_effect(choose("effect", self.effect, CATALOGUE))
+            return
+        rows = [
+            (
+                kind,
+                ", ".join(effect.elements),
+                effect.law,
+                ", ".join(f"{p.name} [{p.unit}]" for p in effect.parameters()),
+                effect.identified_by,
+            )
+            for kind, effect in CATALOGUE.items()
+        ]
+        print_table(("effect", "acts on", "law", "parameters", "identified by"), rows)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,9 +192,9 @@ class List:
         from garat_jax.envs.pairs import PAIRS
         from garat_jax.presets import METHODS
 
-        print_registry("environment", ENVS)
-        print_registry("pair", PAIRS)
-        print_registry("method", METHODS)
+        print_table(("environment", "what it is"), [(n, first_line(e)) for n, e in ENVS.items()])
+        print_table(("pair", "what it is"), [(n, pair.summary) for n, pair in PAIRS.items()])
+        print_table(("method", "what it is"), [(n, first_line(m)) for n, m in METHODS.items()])
 
 
 COMMANDS: dict[str, type[Command]] = {
@@ -260,9 +277,27 @@ def check_files(paths: Sequence[Path], what: str) -> None:
             raise UserError(f"{what}: there is no file {path}")
 
 
-def print_registry(title: str, registry: Mapping[str, Any]) -> None:
-    """Print the names in a registry, each with the first line of what its entry says of itself."""
-    table = Table(title, "what it is")
-    for name, entry in sorted(registry.items()):
-        table.add_row(name, (inspect.getdoc(entry) or "").partition("\n")[0])
-    Console().print(table)
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table, as wide as the terminal or, where there is none, as its content."""
+    table = Table(*columns)
+    for row in rows:
+        table.add_row(*row)
+    console = Console()
+    width = console.width if console.is_terminal else max(console.width, 160)
+    Console(width=width, markup=False).print(table)
+
+
+def print_effect(effect: "type[Effect]") -> None:
+    """Print what an effect does, and its parameters with units, bounds and their source."""
+    say(f"{effect.kind}: {effect.law}\n\n{inspect.getdoc(effect)}\n")
+    say(f"Acts on: {', '.join(effect.elements)}. Identified by: {effect.identified_by}.")
+    rows = [
+        (p.name, p.unit, f"{p.nominal:g}", f"{p.low:g} to {p.high:g}", p.source)
+        for p in effect.parameters()
+    ]
+    print_table(("parameter", "unit", "no effect", "bounds", "source of the bounds"), rows)
+
+
+def first_line(entry: Any) -> str:
+    """Return the first line of what an entry says of itself."""
+    return (inspect.getdoc(entry) or "").partition("\n")[0]

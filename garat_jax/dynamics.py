@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from flax import struct
-from mujoco import mjx
 
+from garat_jax._mjx import mjx
 from garat_jax.effects.base import OBJECT_TYPES, Effect, ModelView
 from garat_jax.engine import HostModel
 from garat_jax.errors import UserError, unknown_name

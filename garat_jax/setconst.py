@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
+
+from garat_jax._mjx import mjx
 
 CONSTANT_INPUTS = frozenset(
     {"body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"}
