@@ -10,8 +10,20 @@ __version__ = "0.1.0"
 
 # Public name -> the module that defines it.
 _PUBLIC_NAMES: dict[str, str] = {
+    "CATALOGUE": "garat_jax.effects",
+    "Env": "garat_jax.env",
+    "Override": "garat_jax.dynamics",
+    "Pair": "garat_jax.transfer",
+    "Recording": "garat_jax.diagnosis",
     "RunDirectory": "garat_jax.runs",
+    "Task": "garat_jax.env",
+    "TransferConfig": "garat_jax.transfer",
     "UserError": "garat_jax.errors",
+    "compare": "garat_jax.diagnosis",
+    "diagnose": "garat_jax.diagnosis",
+    "load_model": "garat_jax.diagnosis",
+    "make_world": "garat_jax.env",
+    "run_transfer": "garat_jax.transfer",
 }
 
 __all__ = ["__version__", *_PUBLIC_NAMES]  # pyright: ignore[reportUnsupportedDunderAll]
