@@ -1,0 +1,115 @@
+"""Small environments without physics; each can only be learned with one particular faculty."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from garat_jax.env import Env, EnvState, StepResult
+
+
+class Probe(Env):
+    """One observation and one action in [-1, 1]; an episode is one step that terminates."""
+
+    obs_size = 1
+    action_low = np.full(1, -1.0)
+    action_high = np.full(1, 1.0)
+    episode_length = 1
+    terminates = True
+
+    def first_obs(self, key: jax.Array) -> jax.Array:
+        """Draw the first observation, []."""
+        del key
+        return jnp.zeros(())
+
+    def next_obs(self, obs: jax.Array) -> jax.Array:
+        """Return the observation that follows, []."""
+        return obs
+
+    def reward(self, obs: jax.Array, action: jax.Array) -> jax.Array:
+        """Return the reward for an action [] after an observation [], []."""
+        del obs, action
+        return jnp.ones(())
+
+    def reset(self, params, key) -> EnvState:
+        del params
+        return EnvState(None, self.first_obs(key)[None], jnp.zeros((), jnp.int32))
+
+    def step(self, params, state, action, key) -> StepResult:
+        del params, key
+        reward = self.reward(state.obs[0], self.clip(action)[0])
+        steps = state.steps + 1
+        over = steps >= self.episode_length
+        after = EnvState(None, self.next_obs(state.obs[0])[None], steps)
+        return StepResult(after, reward, over & self.terminates, over & (not self.terminates))
+
+
+class ConstantReward(Probe):
+    """Faculty: the value's regression. V = 1."""
+
+
+class ValueOfObs(Probe):
+    """Faculty: the value sees the observation. V(obs) = obs."""
+
+    def first_obs(self, key):
+        return jax.random.rademacher(key, (), jnp.float32)
+
+    def reward(self, obs, action):
+        return obs
+
+
+class DelayedReward(Probe):
+    """Faculty: discounting. The reward comes at the second step: V(0) = γ, V(1) = 1."""
+
+    episode_length = 2
+
+    def next_obs(self, obs):
+        return obs + 1
+
+    def reward(self, obs, action):
+        return obs
+
+
+class Truncated(Probe):
+    """Faculty: bootstrapping. Time is up after each step, and yet V = 1 / (1 - γ)."""
+
+    terminates = False
+
+
+class ActionMatters(Probe):
+    """Faculty: the policy's advantage. The best action is 0.5."""
+
+    def reward(self, obs, action):
+        return -jnp.square(action - 0.5)
+
+
+class ActionAndObsMatter(Probe):
+    """Faculty: the policy sees the observation. The best action is half of it."""
+
+    def first_obs(self, key):
+        return jax.random.rademacher(key, (), jnp.float32)
+
+    def reward(self, obs, action):
+        return -jnp.square(action - 0.5 * obs)
+
+
+PROBES: dict[str, Probe] = {
+    "constant reward": ConstantReward(),
+    "value of obs": ValueOfObs(),
+    "delayed reward": DelayedReward(),
+    "truncated": Truncated(),
+    "action matters": ActionMatters(),
+    "action and obs matter": ActionAndObsMatter(),
+}
+
+
+class AnyProbe(Probe):
+    """All of them; `params` is the index of the one to be, so that one program serves all."""
+
+    def reset(self, params, key):
+        return jax.lax.switch(params, [partial(p.reset, None) for p in PROBES.values()], key)
+
+    def step(self, params, state, action, key):
+        steps = [partial(p.step, None) for p in PROBES.values()]
+        return jax.lax.switch(params, steps, state, action, key)
