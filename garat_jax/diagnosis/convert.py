@@ -12,12 +12,12 @@ from garat_jax.diagnosis.tables import read_table
 from garat_jax.errors import UserError
 
 FREE_PENDULUM_FILE = "SinglePendulumDataForParameterEstimation.mat"
-# dynamicslab/MultiArm-Pendulum (MIT), EstimatedParameters_SinglePendulum.mat: distance to the centre
-# of mass 0.147755 m, mass 0.147585 kg, inertia about the centre of mass 1.09119e-4 kg m², gravity
-# 9.81 m/s². Its viscous friction is left out: that is what there is to be found. An angle of 0 is
-# upright, so the body lies along +z at 0.
+# dynamicslab/MultiArm-Pendulum (MIT), EstimatedParameters_SinglePendulum.mat: distance to the
+# centre of mass 0.147755 m, mass 0.147585 kg, inertia about the centre of mass 1.09119e-4 kg m²,
+# gravity 9.81 m/s². Its viscous friction is left out: that is what there is to be found. An angle
+# of 0 is upright, so the body lies along +z at 0.
 FREE_PENDULUM_MJCF = """<mujoco model="free_pendulum">
-  <option timestep="0.001" gravity="0 0 -9.81" integrator="RK4"/>
+  <option timestep="0.004" gravity="0 0 -9.81" integrator="RK4"/>
   <worldbody>
     <body name="arm">
       <joint name="pivot" type="hinge" axis="0 1 0"/>
@@ -27,10 +27,11 @@ FREE_PENDULUM_MJCF = """<mujoco model="free_pendulum">
 </mujoco>
 """
 
-# dfki-ric-underactuated-lab/torque_limited_simple_pendulum (BSD-3-Clause), its documentation of the
-# hardware: point mass 0.546 kg at 0.5 m, rod and mounting 0.13 kg, in all 0.676 kg with the centre of
-# mass at 0.45 m; rotor inertia 6.07e-5 kg m² before the 6:1 gear. The rod's centre of mass follows:
-# (0.676 * 0.45 - 0.546 * 0.5) / 0.13 = 0.24 m; its length of 0.48 m gives its inertia.
+# dfki-ric-underactuated-lab/torque_limited_simple_pendulum (BSD-3-Clause), its documentation of
+# the hardware: point mass 0.546 kg at 0.5 m, rod and mounting 0.13 kg, in all 0.676 kg with the
+# centre of mass at 0.45 m; rotor inertia 6.07e-5 kg m² before the 6:1 gear. The rod's centre of
+# mass follows: (0.676 * 0.45 - 0.546 * 0.5) / 0.13 = 0.24 m, and with a length of 0.48 m its
+# inertia.
 MOTOR_PENDULUM_MJCF = """<mujoco model="motor_pendulum">
   <option timestep="0.002" gravity="0 0 -9.81"/>
   <worldbody>

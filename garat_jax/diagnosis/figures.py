@@ -123,7 +123,7 @@ def where_it_fails(places: Sequence[Place]) -> go.Figure:
             hoverinfo="skip",
         )
     )
-    figure = styled(figure, height=90 + LINE_HEIGHT * len(shown), bargap=0.35)
+    figure = styled(figure, height=130 + LINE_HEIGHT * len(shown), bargap=0.35)
     return figure.update_xaxes(
         title_text="share of the missing torque that goes with it [%]", range=[0, 105]
     )
@@ -132,7 +132,7 @@ def where_it_fails(places: Sequence[Place]) -> go.Figure:
 def missing_torques(
     measured: MissingTorque, explained: MissingTorque | None, dof: int, unit: str
 ) -> go.Figure:
-    """Draw one joint's missing torque against velocity, position and command.
+    """Draw one joint's missing torque against velocity, position, command and its change.
 
     Args:
         measured: From the measurements.
@@ -144,6 +144,7 @@ def missing_torques(
     axes = [("velocity", f"velocity [{unit}/s]"), ("position", f"position [{unit}]")]
     if np.ptp(measured.command[:, dof]) > 0:
         axes.append(("command", f"torque commanded [{force}]"))
+        axes.append(("change", f"change of the torque commanded [{force} a sample]"))
     figure = make_subplots(len(axes), 1, vertical_spacing=0.28 / len(axes))
     step = max(1, len(measured.time) // MOST_POINTS)
     for row, (field, title) in enumerate(axes, start=1):
@@ -207,7 +208,7 @@ def ranking(candidates: Sequence[Candidate]) -> go.Figure:
             line={"color": colour, "width": 3},
             hoverinfo="x",
         )
-    figure = styled(figure, height=100 + LINE_HEIGHT * len(shown), showlegend=False)
+    figure = styled(figure, height=130 + LINE_HEIGHT * len(shown), showlegend=False)
     figure.add_vline(0, line={"color": SOFT, "width": 1})
     return figure.update_xaxes(title_text="fall of the held-out error [% of the spread]")
 
@@ -260,6 +261,8 @@ def _path(played: Replay, recording: Recording, index: int, signal: int):
 
 def _abscissa(missing: MissingTorque, field: str, dof: int, unit: str) -> np.ndarray:
     """Return a column of the missing torque; angles are taken within one turn."""
+    if field == "change":
+        return np.gradient(missing.command[:, dof])
     values = getattr(missing, field)[:, dof]
     if field == "position" and unit == "rad" and np.ptp(values) > 2 * np.pi:
         return (values + np.pi) % (2 * np.pi) - np.pi

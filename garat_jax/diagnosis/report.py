@@ -302,7 +302,7 @@ def _where(places: Sequence[Place], view: View) -> list[Section]:
             f"The missing torque at {places[0].signal}",
             "The shape of this cloud tells effects apart: a step at zero velocity is dry friction, "
             "a slope is viscous friction, a level is an offset, a slope against the command is a "
-            f"wrong gain.{law}",
+            f"wrong gain, and a slope against the command's change is a delay.{law}",
             figures=[
                 Figure(
                     figures.missing_torques(view.missing, view.explained, dof, unit),
@@ -324,12 +324,11 @@ def _ranking(diagnosis: Diagnosis) -> list[Section]:
             round(100 * c.share),
             100 * c.error_after if was_fitted(c) else None,
             round(100 * c.stability) if was_fitted(c) else None,
-            ", ".join(f"{words(n.effect)} at {n.target}" for n in c.indistinguishable_from),
-            c.why,
+            c.why + _alike(c),
         )
         for c in diagnosis.candidates
     ]
-    columns = ["effect", "size", "share [%]", "error [%]", "stable [%]", "looks like", "verdict"]
+    columns = ["effect", "size", "share [%]", "error [%]", "stable [%]", "verdict"]
     drawn = []
     if any(map(was_fitted, diagnosis.candidates)):
         drawn.append(
@@ -355,12 +354,17 @@ def _ranking(diagnosis: Diagnosis) -> list[Section]:
                     "Share: of the fitted recordings' squared error that it explains. Error: on "
                     "held-out recordings once it is fitted; effects without one were ruled out "
                     "before. Stable: how often it, or one that looks like it, comes out first when "
-                    "the recordings are resampled. Looks like: effects that these recordings "
-                    "cannot tell from it.",
+                    "the recordings are resampled.",
                 )
             ],
         )
     ]
+
+
+def _alike(candidate: Candidate) -> str:
+    """Return a clause with the effects that the recordings cannot tell from a candidate."""
+    names = [f"{words(n.effect)} at {n.target}" for n in candidate.indistinguishable_from]
+    return f"; these recordings cannot tell it from {' or '.join(names)}" if names else ""
 
 
 def _ladder(diagnosis: Diagnosis) -> list[Section]:

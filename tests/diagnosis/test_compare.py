@@ -1,0 +1,120 @@
+"""Comparison: errors of known size are found, and what a user gets is complete."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from garat_jax import cli
+from garat_jax.diagnosis import compare, load_model
+from garat_jax.diagnosis.hidden import make_recordings
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.replay import Replay, as_recordings, replay
+from garat_jax.diagnosis.simulate import Segments
+from tests import models
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A model, and recordings without and with dry friction."""
+    folder = tmp_path_factory.mktemp("recorded")
+    path = folder / "pendulum.xml"
+    path.write_text(models.PENDULUM)
+    files = {}
+    for kind in ("none", "coulomb_friction"):
+        made = make_recordings(path, folder / kind, 0, num_recordings=2, seconds=3.0, kind=kind)
+        files[kind] = (*made.fit, *made.holdout)
+    return path, files
+
+
+def read(recorded, kind):
+    path, files = recorded
+    model = load_model(path)
+    host = model.compile(engine="mujoco").host.model
+    return model, [Recording.read(file, host) for file in files[kind]]
+
+
+def test_a_true_model_is_at_the_noise_floor(recorded):
+    found = compare(*read(recorded, "none"))
+    assert found.error.before < 1.2 * found.error.noise_floor
+    assert "near the sensors' noise" in found.sentence
+
+
+def test_missing_friction_is_seen_and_placed(recorded):
+    found = compare(*read(recorded, "coulomb_friction"))
+    assert found.error.before > 3 * found.error.noise_floor
+    assert found.where[0].signal == "hinge"
+    assert "Most goes wrong at hinge" in found.sentence
+    errors = [h.error for h in found.horizons]
+    assert errors == sorted(errors)
+
+
+def test_velocity_is_left_out_where_it_was_not_measured(recorded):
+    model, recordings = read(recorded, "none")
+    recordings = [dataclasses.replace(r, velocity_measured=False) for r in recordings]
+    assert list(compare(model, recordings).error.per_signal) == ["qpos.hinge"]
+
+
+def test_command_writes_what_scripts_read(recorded, tmp_path, capsys):
+    path, files = recorded
+    names = [str(file) for file in files["coulomb_friction"]]
+    assert cli.main(["compare", str(path), *names, "--out", str(tmp_path / "run")]) == 0
+    content = json.loads((tmp_path / "run" / "compare.json").read_text())
+    assert content["format"] == "garat-compare/1"
+    assert content["error"]["after"] == content["error"]["before"]
+    assert content["error"]["per_signal"]["qvel.hinge"]["unit"] == "rad/s"
+    assert {"signal", "share", "regime", "evidence"} == set(content["where"][0])
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "Comparison of pendulum" in page
+    assert "Measured against simulated" in page
+    assert "report:" in capsys.readouterr().out
+
+
+def test_command_refuses_a_recording_of_another_model(recorded, tmp_path, capsys):
+    _, files = recorded
+    arm = tmp_path / "arm.xml"
+    arm.write_text(models.ARM)
+    status = cli.main(["compare", str(arm), str(files["none"][0]), "--out", str(tmp_path / "run")])
+    assert status == 2
+    assert "unknown column 'qpos.hinge'" in capsys.readouterr().err
+
+
+def handmade(predicted, measured, weight) -> Replay:
+    empty = np.zeros((len(measured), 1))
+    segments = Segments(
+        measured=measured,
+        weight=weight,
+        start=empty,
+        ctrl=empty,
+        place=empty,
+        recording=np.zeros(len(measured), int),
+        first=np.arange(len(measured)) * measured.shape[1],
+        noise=np.asarray([0.1]),
+        spread=np.asarray([2.0]),
+    )
+    return Replay(1.0, ("qpos.hinge",), ("rad",), segments, predicted)
+
+
+def test_sizes_by_hand():
+    measured = np.zeros((2, 2, 1))
+    predicted = np.asarray([[[3.0], [4.0]], [[0.0], [99.0]]])
+    played = handmade(predicted, measured, np.asarray([[1.0, 1.0], [1.0, 0.0]]))
+    size = played.sizes()["qpos.hinge"]
+    assert size.rmse == pytest.approx(np.sqrt((9 + 16 + 0) / 3))
+    assert size.relative == pytest.approx(size.rmse / 2)
+    assert size.fit_percent == pytest.approx(100 * (1 - size.rmse / 2))
+    assert played.error() == pytest.approx(size.relative)
+    assert played.worst(1) == [0]
+
+
+def test_predictions_take_the_place_of_measurements(recorded):
+    model, recordings = read(recorded, "none")
+    (played,) = replay(model, recordings, [0.5])
+    perfect = dataclasses.replace(played, predicted=played.segments.measured)
+    host = model.compile(engine="mujoco").host.model
+    for made, original in zip(as_recordings(perfect, recordings, host), recordings, strict=True):
+        for a, b in made.spans:
+            np.testing.assert_array_equal(made.qpos[a:b], original.qpos[a:b])
+            np.testing.assert_array_equal(made.qvel[a:b], original.qvel[a:b])
+        assert made.spans[0][0] == 0

@@ -1,0 +1,151 @@
+"""The diagnosis report: says each verdict in words and holds every part."""
+
+import dataclasses
+import re
+
+import pytest
+
+from garat_jax.diagnosis import Diagnosis, Recording, load_model
+from garat_jax.diagnosis.hidden import make_recordings
+from garat_jax.diagnosis.localise import Place
+from garat_jax.diagnosis.report import diagnosis_lead, repaired, write_diagnosis
+from garat_jax.diagnosis.results import (
+    Candidate,
+    Errors,
+    Estimate,
+    Experiment,
+    Interval,
+    Named,
+    Rung,
+)
+from garat_jax.runs import RunDirectory
+from tests import models
+
+NAN = float("nan")
+FRICTION = Candidate(
+    effect="coulomb_friction",
+    target="joint/hinge",
+    parameters={"torque": Estimate(0.06, 0.055, 0.065, "N m")},
+    share=0.9,
+    p_value=1e-9,
+    error_after=0.011,
+    held_out_gain=Interval(0.2, 0.15, 0.25),
+    stability=1.0,
+    indistinguishable_from=(Named("viscous_damping", "joint/hinge"),),
+    passes=True,
+    why="passes every gate",
+)
+OFFSET = dataclasses.replace(
+    FRICTION,
+    effect="torque_offset",
+    error_after=NAN,
+    held_out_gain=Interval(NAN, NAN, NAN),
+    indistinguishable_from=(),
+    passes=False,
+    why="others explain more",
+)
+MISSING = Diagnosis(
+    model="pendulum.xml",
+    data=("recording_0.csv",),
+    holdout=("recording_1.csv",),
+    versions={},
+    seconds=1.0,
+    verdict="missing_effect",
+    error=Errors(
+        "error",
+        "1",
+        0.2,
+        0.011,
+        0.01,
+        0.02,
+        {"qpos.hinge": {"before": 0.1, "after": 0.01, "noise_floor": 0.009, "unit": "rad"}},
+    ),
+    where=(Place("hinge", 0.8, "at any speed", "80 % of it is at hinge"),),
+    candidates=(FRICTION, OFFSET),
+    selected=(FRICTION,),
+    ladder=(Rung(None, 0.21, 0.2), Rung(FRICTION, 0.012, 0.011)),
+    next_experiment=Experiment(
+        (Named("coulomb_friction", "joint/hinge"), Named("viscous_damping", "joint/hinge")),
+        "Swing at two amplitudes.",
+    ),
+)
+ADEQUATE = dataclasses.replace(
+    MISSING,
+    verdict="adequate",
+    candidates=(OFFSET,),
+    selected=(),
+    ladder=MISSING.ladder[:1],
+    where=(),
+    next_experiment=None,
+)
+
+
+def write(tmp_path, diagnosis) -> str:
+    """The page without scripts."""
+    path = tmp_path / "pendulum.xml"
+    path.write_text(models.PENDULUM)
+    made = make_recordings(
+        path, tmp_path / "data", 0, num_recordings=2, seconds=1.0, kind="coulomb_friction"
+    )
+    model = load_model(path)
+    host = model.compile(engine="mujoco").host.model
+    fit, holdout = ([Recording.read(p, host) for p in paths] for paths in (made.fit, made.holdout))
+    run = RunDirectory.create(tmp_path / "run", {}, "garat diagnose pendulum.xml", [])
+    page = write_diagnosis(run, diagnosis, model, fit, holdout).read_text(encoding="utf-8")
+    return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_page_of_a_missing_effect_has_every_part(tmp_path):
+    page = write(tmp_path, MISSING)
+    for heading in (
+        "How far the model is off",
+        "Measured against simulated",
+        "Where it fails",
+        "The missing torque at hinge",
+        "Which effects could explain it",
+        "The error falls",
+        "What was added",
+        "What to record next",
+        "How to get these results again",
+    ):
+        assert f"<h2>{heading}</h2>" in page
+    assert "The model lacks coulomb friction at joint/hinge." in page
+    assert "torque 0.06 (0.055 to 0.065) N m" in page
+    assert "these recordings cannot tell it from viscous damping at joint/hinge" in page
+    assert "Swing at two amplitudes." in page
+    assert "recording_1.csv, in which the model as it is does worst" in page
+    assert "garat diagnose pendulum.xml" in page
+    assert "nan" not in page.lower().replace("name", "")
+
+
+def test_page_of_an_adequate_model_promises_no_repair(tmp_path):
+    page = write(tmp_path, ADEQUATE)
+    assert "The model is adequate" in page
+    assert "<h2>What was added</h2>" not in page
+    assert "<h2>The error falls</h2>" not in page
+    assert "repaired" not in page
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "falls from 20 % to 1.1 % of the signals' spread; noise alone makes 1 %."),
+        (
+            {"verdict": "unexplained"},
+            "lacks coulomb friction at joint/hinge, but that is not all",
+        ),
+        (
+            {"verdict": "unexplained", "selected": ()},
+            "Something is missing that no effect in the catalogue explains: 2 % of the error",
+        ),
+    ],
+)
+def test_lead_says_the_verdict(changes, said):
+    assert said in diagnosis_lead(dataclasses.replace(MISSING, **changes))
+
+
+def test_repair_adds_the_effects_with_their_estimates(tmp_path):
+    path = tmp_path / "pendulum.xml"
+    path.write_text(models.PENDULUM)
+    (effect,) = repaired(load_model(path), (FRICTION,)).effects
+    assert (effect.kind, effect.target, effect.torque) == ("coulomb_friction", "joint/hinge", 0.06)
