@@ -139,7 +139,7 @@ def _numbers(path: Path, frame: pd.DataFrame) -> dict[str, np.ndarray]:
     columns = {}
     for name in map(str, frame.columns):
         values = frame[name]
-        if values.isna().all():
+        if not values.notna().to_numpy().any():
             columns[name] = np.full(len(values), np.nan)
             continue
         if pd.api.types.is_numeric_dtype(values) and not pd.api.types.is_bool_dtype(values):
