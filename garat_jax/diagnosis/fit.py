@@ -50,15 +50,15 @@ class Problem:
         residual = np.where(np.isfinite(residual), residual, LARGE)
         return np.clip(residual, -LARGE, LARGE).reshape(*residual.shape[:-2], -1)
 
-    def integrator_error(self, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Return the change of the residuals on halving the physics timestep, [S, N].
+    def integrator_error(
+        self, theta: np.ndarray, start: np.ndarray, residual: np.ndarray
+    ) -> np.ndarray:
+        """Return the change of the residuals [S, N] on halving the physics timestep.
 
         A first-order integrator's error is twice this change.
         """
-        thetas, starts = theta[None], start[None]
-        coarse = self.simulator.predict(thetas, starts, self.segments)
-        fine = self.finer.predict(thetas, starts, self.segments)
-        return (self.whiten(fine) - self.whiten(coarse))[0]
+        fine = self.finer.predict(theta[None], start[None], self.segments)
+        return self.whiten(fine)[0] - residual
 
     def blocks(self) -> np.ndarray:
         """Return each whitened residual's block within its segment, [N]."""
@@ -166,8 +166,11 @@ def difference_steps(problem: Problem, theta: np.ndarray, columns, relative: flo
 
 def settle(problem: Problem, theta: np.ndarray, start: np.ndarray, iterations: int = 6) -> Fit:
     """Estimate the initial state of every segment, damped one by one, at fixed parameters."""
+    return _settle(problem, theta, start, linearise(problem, theta, start, (), ()), iterations)
+
+
+def _settle(problem: Problem, theta, start, lin: Linearisation, iterations: int) -> Fit:
     damping = np.full(len(start), 1e-6)
-    lin = linearise(problem, theta, start, (), ())
     for _ in range(iterations):
         change = _start_step(lin, lin.residual, damping)
         trial = linearise(problem, theta, start + change * lin.start_unit, (), ())
@@ -231,7 +234,7 @@ def fit(problem: Problem, theta, start, free, iterations: int = 12) -> Fit:
         if abs(before - after) < 1e-4 * before or damping > 1e8:
             break
     low, high = _interval(problem, theta, start, lin, free, keep)
-    settled = settle(problem, theta, start, 3)
+    settled = _settle(problem, theta, start, lin, 2)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
     return Fit(theta, free, frozen, settled.start, settled.residual, low, high)
 
@@ -297,7 +300,7 @@ def _interval(problem: Problem, theta, start, lin: Linearisation, free, keep):
     correction = num_blocks / max(num_blocks - num_free, 1)
     covariance = bread @ (scores.T @ scores) @ bread * correction
     half = stats.t.ppf(0.975, max(num_blocks - num_free, 1)) * np.sqrt(np.diag(covariance)) / unit
-    change = 2.0 * problem.integrator_error(theta, start)[..., None]
+    change = 2.0 * problem.integrator_error(theta, start, lin.residual)[..., None]
     shifted = _projected(problem, lin._replace(residual=change[..., 0]))[1]
     shift = -bread @ ((sensitivity / unit).T @ shifted) / unit
     centre = theta[np.asarray(free)[keep]]

@@ -104,10 +104,10 @@ SECRETS: dict[str, Secret] = {
         "actuator", {"rate": 0.05}, gain=lambda t, p: max(0.0, 1.0 - p["rate"] * t)
     ),
 }
-"""Names are the catalogue's; the last two are outside it."""
-DRAWN = tuple(
-    name for name in SECRETS if name not in ("none", "periodic_disturbance", "fading_gain")
-)
+OUTSIDE = ("periodic_disturbance", "fading_gain")
+"""Secrets that the catalogue does not have."""
+DRAWN = tuple(name for name in SECRETS if name not in ("none", *OUTSIDE))
+"""Kinds that `make_recordings` draws from; their names are the catalogue's."""
 
 
 def draw(kind: str, rng: np.random.Generator) -> dict[str, float]:

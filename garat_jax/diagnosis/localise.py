@@ -130,8 +130,9 @@ def _features(m: MissingTorque, dof: int):
     )
     yield "with position", position - position.mean(), "{size:+.3g} N m/rad"
     elapsed = m.time - m.time.min()
-    drift = elapsed / max(float(elapsed.max()), 1e-12)
-    yield "growing with time, with the command", drift * m.command[:, dof], "{size:+.3g} by the end"
+    drift = (elapsed - elapsed.mean()) / max(float(elapsed.max()), 1e-12)
+    words = "the part of the command that is missing changes by {size:+.3g} from start to end"
+    yield "drifting with time, with the command", drift * m.command[:, dof], words
 
 
 def _of_span(model: mujoco.MjModel, recording: Recording, span: slice):

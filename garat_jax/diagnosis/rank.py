@@ -125,7 +125,7 @@ def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
     """Estimate the noise floor; a first-order integrator errs by twice what half a step changes."""
     held_out = ~problem.fitted
     lin = linearise(problem, current.theta, current.start, (), ())
-    change = 2.0 * problem.integrator_error(current.theta, current.start)[..., None]
+    change = 2.0 * problem.integrator_error(current.theta, current.start, lin.residual)[..., None]
     change = StartSpace(lin.start).remove(change)[..., 0]
     noise = metric.counted.astype(float)
     return Floor(

@@ -150,7 +150,7 @@ class Diagnosis:
             return f"Missing: {names} ({fall}, noise floor {error.noise_floor:.3g})."
         share = f"{100 * error.unexplained_share:.0f} % of the error"
         if names:
-            return f"{names} explain a part ({fall}), but {share} stays unexplained."
+            return f"Found {names} ({fall}), but {share} stays unexplained."
         return f"Nothing in the catalogue explains the error: {share} stays unexplained."
 
     def __str__(self) -> str:

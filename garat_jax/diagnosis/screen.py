@@ -132,7 +132,7 @@ def _measure(problem: Problem, fit: Fit, skip) -> _Sensitivities:
     for row, (_, switch) in enumerate(listed):
         if switch is not None:
             changes[row] -= changes[listed.index((switch, None))]
-    integrator = problem.integrator_error(fit.theta, fit.start)
+    integrator = problem.integrator_error(fit.theta, fit.start, lin.residual)
     nuisances = np.stack([integrator, *_offsets(problem)])
     remove = _Remover(lin, fitted)
     columns, candidates = {}, {}

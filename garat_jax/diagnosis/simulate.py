@@ -27,7 +27,7 @@ UNIFORM = 0.01
 """Largest deviation of a sampling interval, relative to their median, that counts as uniform."""
 SHORTEST = 10
 """Samples that a segment must have."""
-BATCH_SIZES = (1, 4, 8, 16, 24, 32, 48, 64, 96, 128)
+BATCH_SIZES = (1, 4, 8, 16, 32)
 """Each width of a batch is compiled once, so widths are rounded up to one of these."""
 SMALLEST_NOISE = 1e-4
 """Noise assumed at least, relative to the signal's standard deviation."""
@@ -276,8 +276,18 @@ class Simulator:
         Returns:
             Predictions, [P, S, L, num_signals]; not finite where a simulation diverged.
         """
+        num_state = start.shape[2]
+        widest = next((w for w in BATCH_SIZES if w >= num_state + 3), BATCH_SIZES[-1])
+        parts = [
+            self._predict_part(theta[i : i + widest], start[i : i + widest], segments)
+            for i in range(0, len(theta), widest)
+        ]
+        return np.concatenate(parts)
+
+    def _predict_part(self, theta, start, segments: Segments) -> np.ndarray:
+        """Predict at most the widest batch, padded to a width that is compiled once."""
         num = len(theta)
-        width = next((size for size in BATCH_SIZES if size >= num), num)
+        width = next(w for w in BATCH_SIZES if w >= num)
         repeat = np.minimum(np.arange(width), num - 1)
         with jax.enable_x64(True):
             result = self._run(theta[repeat], start[repeat], segments.ctrl, segments.place)

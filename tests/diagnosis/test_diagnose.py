@@ -1,0 +1,109 @@
+"""Hide an effect and find it; hide none and say so; hide one outside the catalogue and say that.
+
+Data come from C MuJoCo at a 32nd of the model's timestep. Thresholds were chosen on seeds 0 to 9.
+"""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from garat_jax.diagnosis import Recording, diagnose, load_model
+from garat_jax.diagnosis.convert import free_pendulum
+from garat_jax.diagnosis.hidden import DRAWN, OUTSIDE, make_recordings
+from garat_jax.diagnosis.separate import next_experiment
+from garat_jax.runs import RunDirectory
+
+PENDULUM = Path(__file__).parents[2] / "envs" / "assets" / "pendulum.xml"
+FASTEST = {"num_recordings": 3, "seconds": 4.0, "rate": 125.0}
+
+
+def find(folder, seed: int, kind: str, **size):
+    hidden = make_recordings(PENDULUM, folder, seed, kind=kind, **size)
+    model = load_model(PENDULUM)
+    host = model.compile().host.model
+    fit, holdout = ([Recording.read(p, host) for p in part] for part in hidden[:2])
+    return hidden, diagnose(model, fit, holdout)
+
+
+def check_found(hidden, found):
+    first = found.candidates[0]
+    named = {(first.effect, first.target)}
+    named |= {(n.effect, n.target) for n in first.indistinguishable_from}
+    assert (hidden.kind, hidden.target) in named
+    assert found.verdict == "missing_effect"
+    assert found.error.after < 1.25 * found.error.noise_floor < 0.5 * found.error.before
+    assert found.ladder[0].error_holdout > found.ladder[-1].error_holdout
+    if first.effect == hidden.kind:
+        for name, value in first.parameters.items():
+            assert value.estimate == pytest.approx(hidden.parameters[name], rel=0.05)
+
+
+@pytest.mark.parametrize("kind", ["coulomb_friction", "motor_gain"])
+def test_a_hidden_effect_is_found_and_sized(tmp_path, kind):
+    check_found(*find(tmp_path, 20, kind, **FASTEST))
+
+
+def test_a_clean_model_is_adequate(tmp_path):
+    _, found = find(tmp_path, 20, "none", **FASTEST)
+    assert found.verdict == "adequate"
+    assert not found.selected
+    assert not any(candidate.passes for candidate in found.candidates)
+
+
+def test_an_effect_outside_the_catalogue_is_unexplained_and_the_result_is_plain(tmp_path):
+    _, found = find(tmp_path, 20, "periodic_disturbance", **FASTEST)
+    assert found.verdict == "unexplained"
+    assert found.error.unexplained_share > 0.3
+    content = found.to_json()
+    assert content["format"] == "garat-diagnosis/1"
+    assert "NaN" not in json.dumps(content, allow_nan=False)
+    assert "unexplained" in str(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [20, 21])
+@pytest.mark.parametrize("kind", DRAWN)
+def test_every_kind_that_a_pendulum_shows_is_found(tmp_path, kind, seed):
+    check_found(*find(tmp_path, seed, kind))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20, 26))
+def test_nothing_is_claimed_on_clean_models(tmp_path, seed):
+    assert find(tmp_path, seed, "none")[1].verdict == "adequate"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [20, 21])
+@pytest.mark.parametrize("kind", OUTSIDE)
+def test_effects_outside_the_catalogue_are_unexplained(tmp_path, kind, seed):
+    assert find(tmp_path, seed, kind)[1].verdict == "unexplained"
+
+
+@pytest.mark.slow
+def test_the_free_pendulum_lacks_viscous_damping_and_not_coulomb_friction(tmp_path, shared_data):
+    data = free_pendulum(shared_data / "free_pendulum", tmp_path)
+    model = load_model(data.model)
+    host = model.compile().host.model
+    recordings, holdout = (
+        [Recording.read(p, host) for p in part] for part in (data.fit, data.holdout)
+    )
+    found = diagnose(model, recordings, holdout)
+    assert found.candidates[0].effect == "viscous_damping"
+    assert found.selected[0].effect == "viscous_damping"
+    assert "coulomb_friction" not in [candidate.effect for candidate in found.selected]
+    assert found.verdict == "missing_effect"
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_diagnosis_and_a_report(tmp_path):
+    from garat_jax.diagnosis import run_diagnose
+
+    hidden = make_recordings(PENDULUM, tmp_path / "data", 22, kind="torque_offset", **FASTEST)
+    run = RunDirectory.create(tmp_path / "run", {}, "garat diagnose", [])
+    found = run_diagnose(PENDULUM, (*hidden.fit, *hidden.holdout), (), run)
+    assert found.selected[0].effect == "torque_offset"
+    assert run.read_json("diagnosis.json")["holdout"] == ["recording_2.csv"]
+    assert (run.root / "report.html").is_file()
+    assert next_experiment(found.selected) is None

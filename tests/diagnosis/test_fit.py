@@ -1,0 +1,167 @@
+"""Segments, fits and screening against simulations whose truth is known."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.diagnose import make_candidates, split, thin
+from garat_jax.diagnosis.fit import Problem, StartSpace, fit, settle
+from garat_jax.diagnosis.localise import localise, missing_torque
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.screen import cosine, screen
+from garat_jax.diagnosis.simulate import Simulator, choose_grid, cut, signal_noise
+from garat_jax.effects import ActuatorDelay
+from tests import models
+
+MODEL = Model("pendulum", __file__, __file__, models.spec(models.PENDULUM))
+
+
+def record(time, damping=0.0, delay=0, noise=1e-3, seed=0, command=1.0) -> Recording:
+    """Step C MuJoCo at the model's own timestep, each interval in 2 substeps or more."""
+    rng = np.random.default_rng(seed)
+    model = models.spec(models.PENDULUM).compile()
+    model.dof_damping[0] += damping
+    data = mujoco.MjData(model)
+    data.qpos[0] = 0.8
+    ctrl = command * np.sin(9 * time) * np.sign(np.sin(2 * time))
+    states = []
+    for k in range(len(time)):
+        states.append([data.qpos[0], data.qvel[0]])
+        if k + 1 < len(time):
+            for _ in range(round((time[k + 1] - time[k]) / model.opt.timestep)):
+                data.ctrl[0] = ctrl[max(k - delay, 0)]
+                mujoco.mj_step(model, data)
+    states = np.asarray(states) + noise * rng.normal(size=(len(time), 2)) * [1.0, 10.0]
+    return Recording(
+        name=f"made {seed}",
+        time=time,
+        qpos=states[:, :1],
+        qvel=states[:, 1:],
+        ctrl=ctrl[:, None],
+        torque={},
+        velocity_measured=True,
+        spans=((0, len(time)),),
+        warnings=(),
+    )
+
+
+def make_problem(recordings, candidates, horizon=0.4) -> Problem:
+    grid = choose_grid(recordings, 0.002)
+    segments = cut(recordings, grid, horizon)
+    fitted = np.ones(len(segments.start), bool)
+    coarse, finer = (Simulator(MODEL, candidates, grid, refine) for refine in (1, 2))
+    return Problem(coarse, finer, segments, fitted, grid.interval * grid.per_sample)
+
+
+def candidates():
+    return make_candidates(MODEL, MODEL.compile().host.model)
+
+
+def column(simulator: Simulator, kind: str) -> int:
+    return next(
+        j for j, s in enumerate(simulator.slots) if simulator.effects[s.effect].kind == kind
+    )
+
+
+UNIFORM = np.arange(500) * 0.004
+IRREGULAR = np.cumsum(np.random.default_rng(1).choice([0.002, 0.004, 0.006], 500))
+
+
+@pytest.mark.parametrize("time", [UNIFORM, IRREGULAR], ids=["uniform", "irregular"])
+def test_predictions_are_those_of_a_mujoco_loop(time):
+    problem = make_problem([record(time, noise=0.0)], ())
+    s = problem.segments
+    predicted = problem.simulator.predict(np.zeros((1, 0)), s.start[None], s)[0]
+    error = np.abs(predicted - s.measured)[s.weight > 0].max(axis=0)
+    assert error[0] < 1e-9
+    assert error[1] < 1e-9
+
+
+def test_a_segment_in_the_middle_knows_the_late_commands_before_it():
+    recording = record(UNIFORM, delay=5, noise=0.0)
+    problem = make_problem([recording], (ActuatorDelay("all", delay=0.0),))
+    s = problem.segments
+    predicted = problem.simulator.predict(np.array([[0.02]]), s.start[None], s)[0]
+    np.testing.assert_allclose(predicted, s.measured, atol=1e-9)
+
+
+def test_a_fit_recovers_a_parameter_and_its_interval_covers_it():
+    recordings = [record(UNIFORM, damping=0.02, seed=seed) for seed in range(2)]
+    problem = make_problem(recordings, candidates())
+    free = [column(problem.simulator, "viscous_damping")]
+    found = fit(problem, problem.simulator.base, problem.segments.start, free)
+    assert found.theta[free[0]] == pytest.approx(0.02, rel=0.02)
+    assert found.low[0] < 0.02 < found.high[0]
+    assert np.sqrt(np.mean(found.residual**2)) == pytest.approx(1.0, abs=0.25)
+
+
+def test_settled_initial_states_leave_only_noise():
+    problem = make_problem([record(UNIFORM)], ())
+    settled = settle(problem, np.zeros(0), problem.segments.start + 0.05)
+    assert np.sqrt(np.mean(settled.residual**2)) == pytest.approx(1.0, abs=0.25)
+
+
+def test_initial_states_are_projected_out():
+    rng = np.random.default_rng(0)
+    sensitivity = rng.normal(size=(3, 20, 2))
+    sensitivity[1, :, 1] = 0.0  # an initial state that nothing shows
+    space = StartSpace(sensitivity)
+    rest = space.remove(rng.normal(size=(3, 20, 4)))
+    np.testing.assert_allclose(np.swapaxes(sensitivity, 1, 2) @ rest, 0.0, atol=1e-12)
+
+
+def test_screening_finds_the_effect_and_excludes_what_is_not_excited():
+    recordings = [record(UNIFORM, damping=0.02, seed=seed, command=0.0) for seed in range(2)]
+    problem = make_problem(recordings, candidates())
+    current = settle(problem, problem.simulator.base, problem.segments.start)
+    scores = screen(problem, current)
+    effects = problem.simulator.effects
+    first = scores[0]
+    assert effects[first.effect].kind == "viscous_damping"
+    assert first.size[0] == pytest.approx(0.02, rel=0.1)
+    assert first.p_value < 1e-3
+    assert cosine(first, first) == pytest.approx(1.0)
+    dead = {effects[s.effect].kind: s.excluded for s in scores if s.excluded}
+    assert "do not excite" in dead["motor_gain"]
+    assert "do not excite" in dead["actuator_delay"]
+
+
+def test_the_missing_torque_says_where():
+    places = localise(
+        missing_torque(MODEL.compile().host.model, [record(UNIFORM, damping=0.05, noise=0.0)])
+    )
+    assert places[0].signal == "hinge"
+    assert places[0].regime == "in proportion to speed"
+    assert places[0].share > 0.8
+    assert "against the motion" in places[0].evidence
+
+
+def test_velocities_that_contradict_positions_count_as_noise():
+    rng = np.random.default_rng(0)
+    angle, speed = np.sin(4 * UNIFORM)[:, None], 4 * np.cos(4 * UNIFORM)[:, None]
+    noisy = angle + 1e-4 * rng.normal(size=angle.shape)
+    right = dataclasses.replace(record(UNIFORM), qpos=noisy, qvel=speed)
+    wrong = dataclasses.replace(right, qvel=speed + 0.1 * np.sin(3 * UNIFORM)[:, None])
+    assert signal_noise(right)[1] < 0.01
+    assert signal_noise(wrong)[1] == pytest.approx(0.1 / np.sqrt(2), rel=0.3)
+
+
+def test_hold_out_is_by_recording_and_of_a_single_one_its_last_third():
+    recordings = [record(UNIFORM[:50], seed=seed) for seed in range(5)]
+    fitted, held_out, _ = split(recordings, ())
+    assert [len(fitted), len(held_out)] == [4, 1]
+    (first,), (last,), how = split(recordings[:1], ())
+    assert first.spans == ((0, 33),)
+    assert last.spans == ((33, 50),)
+    assert "last third" in how
+
+
+def test_passive_recordings_are_thinned_and_driven_ones_are_not():
+    fast = record(np.arange(100) * 0.002)
+    passive = dataclasses.replace(fast, ctrl=np.zeros((100, 0)))
+    assert len(thin([passive])[0].time) == 50
+    assert thin([passive])[0].spans == ((0, 50),)
+    assert len(thin([fast])[0].time) == 100
