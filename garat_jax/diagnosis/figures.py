@@ -210,6 +210,9 @@ def ranking(candidates: Sequence[Candidate]) -> go.Figure:
         )
     figure = styled(figure, height=130 + LINE_HEIGHT * len(shown), showlegend=False)
     figure.add_vline(0, line={"color": SOFT, "width": 1})
+    ends = [0.0, *(100 * g.low for g in gains), *(100 * g.high for g in gains)]
+    margin = 0.05 * (max(ends) - min(ends))
+    figure.update_xaxes(range=[min(ends) - margin, max(ends) + margin])
     return figure.update_xaxes(title_text="fall of the held-out error [% of the spread]")
 
 

@@ -1,6 +1,5 @@
 """The report of a diagnosis, and of a comparison, for a reader who was not there."""
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,13 +9,13 @@ import numpy as np
 
 from garat_jax import report
 from garat_jax.diagnosis import figures
-from garat_jax.diagnosis.diagnose import split, thin
+from garat_jax.diagnosis.diagnose import split
 from garat_jax.diagnosis.figures import label, was_fitted, words
-from garat_jax.diagnosis.localise import MissingTorque, Place, missing_torque
+from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.replay import Replay, as_recordings, replay
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Estimate
+from garat_jax.diagnosis.view import View, look
 from garat_jax.effects import CATALOGUE
 from garat_jax.report import Fact, Figure, Reproduce, Section, Table
 from garat_jax.runs import RunDirectory
@@ -24,70 +23,10 @@ from garat_jax.runs import RunDirectory
 if TYPE_CHECKING:
     from garat_jax.diagnosis.compare import Comparison
 
-HORIZONS = (0.2, 0.5, 1.0, 2.0)
-"""Seconds over which errors are drawn."""
 NUM_WORST = 3
 """Segments that are shaded as the worst."""
 NUM_SIGNALS = 4
 """Signals that are drawn, those with the largest relative error."""
-
-
-@dataclasses.dataclass(frozen=True)
-class View:
-    """A model's predictions of the recordings, before and after it was repaired.
-
-    Attributes:
-        recordings: What was measured, those held out last.
-        before: Predictions of the model as it is, by horizon.
-        after: Predictions of the repaired model, by horizon; empty without a repair.
-        missing: The torque that the model lacks, from the measurements.
-        explained: The same from the repaired model's predictions.
-        host: The compiled model.
-    """
-
-    recordings: tuple[Recording, ...]
-    before: tuple[Replay, ...]
-    after: tuple[Replay, ...]
-    missing: MissingTorque
-    explained: MissingTorque | None
-    host: mujoco.MjModel
-
-    @property
-    def middle(self) -> int:
-        """Which horizon traces are drawn of: the longest up to half a second."""
-        usable = [i for i, played in enumerate(self.before) if played.horizon <= 0.5]
-        return usable[-1] if usable else 0
-
-
-def repaired(model: Model, selected: Sequence[Candidate]) -> Model:
-    """Return a model with the effects that a diagnosis found."""
-    effects = tuple(
-        CATALOGUE[c.effect](target=c.target, **{n: e.estimate for n, e in c.parameters.items()})
-        for c in selected
-    )
-    return dataclasses.replace(model, effects=(*model.effects, *effects))
-
-
-def look(model: Model, recordings: Sequence[Recording], selected: Sequence[Candidate] = ()) -> View:
-    """Simulate what the report shows.
-
-    Args:
-        model: The model as it was given.
-        recordings: What was measured, those held out last.
-        selected: The effects that a diagnosis found.
-    """
-    recordings = thin(recordings)
-    host = model.compile(engine="mujoco").host.model
-    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
-    horizons = [h for h in HORIZONS if h <= longest] or [longest]
-    before = replay(model, recordings, horizons)
-    after = replay(repaired(model, selected), recordings, horizons) if selected else ()
-    explained = None
-    if after:
-        as_measured = as_recordings(after[-1], recordings, host)
-        explained = missing_torque(host, as_measured)
-    missing = missing_torque(host, recordings)
-    return View(recordings, before, after, missing, explained, host)
 
 
 def write_diagnosis(
@@ -145,7 +84,7 @@ def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     return [
         Fact(_percent(error.before), "error of the model as it is, of each signal's spread"),
         Fact(_percent(error.after), "error with the effects that were found"),
-        Fact(_percent(error.noise_floor), "noise floor: no model can be better"),
+        Fact(_percent(error.noise_floor), "noise floor: what noise alone would make"),
         Fact(_percent(error.unexplained_share), "of the error stays unexplained"),
     ]
 
@@ -161,7 +100,7 @@ def diagnosis_sections(
     view = look(model, (*fitted, *held_out), diagnosis.selected)
     shown = range(len(fitted), len(view.recordings))
     return [
-        _errors(diagnosis.error, view),
+        _errors(diagnosis.error, view, shown),
         _traces(view, shown),
         *_where(diagnosis.where, view),
         *_ranking(diagnosis),
@@ -181,7 +120,7 @@ def write_comparison(
     error, view = comparison.error, look(model, recordings)
     facts = [
         Fact(_percent(error.before), "error, of each signal's spread"),
-        Fact(_percent(error.noise_floor), "noise floor: no model can be better"),
+        Fact(_percent(error.noise_floor), "noise floor: what noise alone would make"),
         Fact(str(len(recordings)), "recordings"),
     ]
     everything = range(len(recordings))
@@ -192,7 +131,7 @@ def write_comparison(
         lead=comparison.sentence,
         facts=facts,
         sections=[
-            _errors(error, view),
+            _errors(error, view, everything),
             _traces(view, everything),
             *_where(comparison.where, view),
         ],
@@ -204,7 +143,8 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
-def _errors(error: Errors, view: View) -> Section:
+def _errors(error: Errors, view: View, chosen: Sequence[int]) -> Section:
+    before, after = ([p.only(chosen) for p in played] for played in (view.before, view.after))
     stated = [
         (
             name,
@@ -218,9 +158,10 @@ def _errors(error: Errors, view: View) -> Section:
     columns = ["signal", "unit", "model as it is", *(["repaired"] if view.after else []), "noise"]
     by_horizon = [
         (name, size.unit, *(p.sizes()[name].rmse for p in played))
-        for name, size in view.before[0].sizes().items()
-        for played in [view.after or view.before]
+        for name, size in before[0].sizes().items()
+        for played in [after or before]
     ]
+    over = f"over {', '.join(view.recordings[i].name for i in chosen)}"
     which = "repaired model" if view.after else "model as it is"
     return Section(
         "How far the model is off",
@@ -230,9 +171,9 @@ def _errors(error: Errors, view: View) -> Section:
         f"predicting the signal's mean.\n\nThe error stated in this report is the {error.metric}.",
         figures=[
             Figure(
-                figures.errors_by_horizon(view.before, view.after, error.noise_floor),
-                "Error over all recordings against how far ahead is predicted. At the dotted line "
-                "the sensors' noise alone is left.",
+                figures.errors_by_horizon(before, after, error.noise_floor),
+                f"Error {over} against how far ahead is predicted. At the dotted line the sensors' "
+                "noise alone is left.",
                 "Error by horizon",
             )
         ],
@@ -241,7 +182,7 @@ def _errors(error: Errors, view: View) -> Section:
             Table(
                 ["signal", "unit", *(f"{p.horizon:g} s" for p in view.before)],
                 by_horizon,
-                f"Root mean square error of the {which} by horizon, over all recordings.",
+                f"Root mean square error of the {which} by horizon, {over}.",
             ),
         ],
     )

@@ -8,7 +8,7 @@ import pytest
 from garat_jax.diagnosis import Diagnosis, Recording, load_model
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.localise import Place
-from garat_jax.diagnosis.report import diagnosis_lead, repaired, write_diagnosis
+from garat_jax.diagnosis.report import diagnosis_lead, write_diagnosis
 from garat_jax.diagnosis.results import (
     Candidate,
     Errors,
@@ -18,6 +18,7 @@ from garat_jax.diagnosis.results import (
     Named,
     Rung,
 )
+from garat_jax.diagnosis.view import repaired
 from garat_jax.runs import RunDirectory
 from tests import models
 

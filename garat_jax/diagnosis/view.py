@@ -1,0 +1,75 @@
+"""What a report shows: predictions before and after the repair, and the missing torque."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import mujoco
+
+from garat_jax.diagnosis.diagnose import thin
+from garat_jax.diagnosis.localise import MissingTorque, missing_torque
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.replay import Replay, as_recordings, replay
+from garat_jax.diagnosis.results import Candidate
+from garat_jax.effects import CATALOGUE
+
+HORIZONS = (0.2, 0.5, 1.0, 2.0)
+"""Seconds over which errors are drawn."""
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A model's predictions of the recordings, before and after it was repaired.
+
+    Attributes:
+        recordings: What was measured, those held out last.
+        before: Predictions of the model as it is, by horizon.
+        after: Predictions of the repaired model, by horizon; empty without a repair.
+        missing: The torque that the model lacks, from the measurements.
+        explained: The same from the repaired model's predictions.
+        host: The compiled model.
+    """
+
+    recordings: tuple[Recording, ...]
+    before: tuple[Replay, ...]
+    after: tuple[Replay, ...]
+    missing: MissingTorque
+    explained: MissingTorque | None
+    host: mujoco.MjModel
+
+    @property
+    def middle(self) -> int:
+        """Which horizon traces are drawn of: the longest up to half a second."""
+        usable = [i for i, played in enumerate(self.before) if played.horizon <= 0.5]
+        return usable[-1] if usable else 0
+
+
+def repaired(model: Model, selected: Sequence[Candidate]) -> Model:
+    """Return a model with the effects that a diagnosis found."""
+    effects = tuple(
+        CATALOGUE[c.effect](target=c.target, **{n: e.estimate for n, e in c.parameters.items()})
+        for c in selected
+    )
+    return dataclasses.replace(model, effects=(*model.effects, *effects))
+
+
+def look(model: Model, recordings: Sequence[Recording], selected: Sequence[Candidate] = ()) -> View:
+    """Simulate what the report shows.
+
+    Args:
+        model: The model as it was given.
+        recordings: What was measured, those held out last.
+        selected: The effects that a diagnosis found.
+    """
+    recordings = thin(recordings)
+    host = model.compile(engine="mujoco").host.model
+    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
+    horizons = [h for h in HORIZONS if h <= longest] or [longest]
+    before = replay(model, recordings, horizons)
+    after = replay(repaired(model, selected), recordings, horizons) if selected else ()
+    explained = None
+    if after:
+        as_measured = as_recordings(after[-1], recordings, host)
+        explained = missing_torque(host, as_measured)
+    missing = missing_torque(host, recordings)
+    return View(recordings, before, after, missing, explained, host)
