@@ -1,0 +1,116 @@
+"""Bridges to other libraries' environments: Brax's training runs on ours.
+
+Brax splits raw PRNG keys and steps actions in [-1, 1]; both stay on its side of the bridge.
+"""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import brax.envs.base
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from garat_jax.env import Env
+from garat_jax.types import Params
+
+KEY = "key"
+"""Where a Brax state's `info` carries the raw PRNG key of an environment's next step."""
+
+
+class BraxEnv(brax.envs.base.Env):
+    """One of our environments as Brax's; see `to_brax`.
+
+    Attributes:
+        sys: The environment's parameters, under the name that Brax's domain randomisation replaces.
+    """
+
+    def __init__(self, env: Env, params: Params):
+        self.env = env
+        self.sys = params
+        bounded = np.isfinite(env.action_low) & np.isfinite(env.action_high)
+        low = np.where(bounded, env.action_low, -1.0)
+        high = np.where(bounded, env.action_high, 1.0)
+        self._half_range, self._middle = (high - low) / 2, (high + low) / 2
+
+    def reset(self, rng: jax.Array) -> brax.envs.base.State:
+        """Start an episode from a raw key [2]."""
+        reset_key, key = jax.random.split(jax.random.wrap_key_data(rng))
+        state = self.env.reset(self.sys, reset_key)
+        zero = jnp.zeros((), jnp.float32)
+        info = {KEY: jax.random.key_data(key)}
+        return brax.envs.base.State(_any(state), state.obs, zero, zero, {}, info)
+
+    def step(self, state: brax.envs.base.State, action: jax.Array) -> brax.envs.base.State:
+        """Take one control step; `done` says only that the task ended it."""
+        step_key, key = jax.random.split(jax.random.wrap_key_data(state.info[KEY]))
+        sent = self._middle + self._half_range * action
+        result = self.env.step(self.sys, _any(state.pipeline_state), sent, step_key)
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            pipeline_state=result.state,
+            obs=result.state.obs,
+            reward=result.reward,
+            done=result.terminated.astype(jnp.float32),
+            info={**state.info, KEY: jax.random.key_data(key)},
+        )
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an observation."""
+        return self.env.obs_size
+
+    @property
+    def action_size(self) -> int:
+        """Number of actions."""
+        return self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        """What Brax calls the physics; ours is in the parameters."""
+        return "mjx"
+
+
+def to_brax(env: Env, params: Params) -> BraxEnv:
+    """Make an environment one of Brax's, for `brax.training` and its wrappers.
+
+    Actions in [-1, 1] span the range of each bounded action; unbounded ones pass as they are. Time
+    limits are Brax's: give its `train` or `EpisodeWrapper` the `episode_length` of the environment.
+
+    Args:
+        env: The environment.
+        params: Its parameters.
+    """
+    return BraxEnv(env, params)
+
+
+@contextlib.contextmanager
+def brax_on_new_jax() -> Iterator[None]:
+    """Give JAX back `device_put_replicated`, which Brax 0.14.2 calls and JAX 0.10 removed.
+
+    Use it around `brax.training.agents.*.train.train`; nothing else needs it.
+    """
+    name = "device_put_replicated"
+    before = vars(jax).get(name)
+    setattr(jax, name, _device_put_replicated)
+    try:
+        yield
+    finally:
+        if before is None:
+            delattr(jax, name)
+        else:
+            setattr(jax, name, before)
+
+
+def _device_put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
+    """Put a copy of every leaf on every device: [...] to [devices, ...], split along the first."""
+    # The name is that of Brax's own pmap axis: JAX lets one program mix no two meshes.
+    sharding = NamedSharding(Mesh(np.asarray(devices), ("i",)), PartitionSpec("i"))
+    copies = jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
+    return jax.device_put(copies, sharding)
+
+
+def _any(value: Any) -> Any:
+    """Hide a type: Brax declares a state of its own physics where any pytree will do."""
+    return value
