@@ -1,6 +1,8 @@
 """The one host loop: compile, step, evaluate, log, checkpoint, resume, and stop on NaN."""
 
 import dataclasses
+import functools
+import os
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -21,6 +23,7 @@ CHECKPOINT_SECONDS = 60.0
 REPORT_SECONDS = 5.0
 DEEP_CHAIN = 5
 """Joints in a chain from which XLA's CPU fusion emitters slow MJX down; see docs/performance.md."""
+FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
 
 
 @dataclasses.dataclass
@@ -232,9 +235,19 @@ def compiler_options(dynamics: Dynamics) -> dict[str, Any]:
     """
     if dynamics.engine != "mjx" or jax.default_backend() != "cpu":
         return {}
-    if chain_depth(dynamics) < DEEP_CHAIN:
+    if chain_depth(dynamics) < DEEP_CHAIN or FUSION_EMITTERS in os.environ.get("XLA_FLAGS", ""):
         return {}
-    return {"xla_cpu_use_fusion_emitters": False}
+    return {FUSION_EMITTERS: False} if is_known_option(FUSION_EMITTERS) else {}
+
+
+@functools.cache
+def is_known_option(name: str) -> bool:
+    """Say whether the installed XLA takes a compiler option; it refuses those it does not know."""
+    try:
+        jax.jit(lambda x: x + 1, compiler_options={name: False}).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def chain_depth(dynamics: Dynamics) -> int:

@@ -1,0 +1,37 @@
+"""XLA's options for MJX on deep kinematic chains."""
+
+import mujoco
+import pytest
+
+from garat_jax import dynamics, train
+
+JOINT = "<body pos='0 0 .1'><joint axis='0 1 0'/><geom size='.02' mass='.1'/>"
+
+
+def make_chain(depth: int, engine: str = "mjx"):
+    bodies = JOINT * depth + "</body>" * depth
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    return dynamics.compile(spec, engine=engine)
+
+
+@pytest.fixture(autouse=True)
+def no_flags(monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+
+
+def test_only_deep_chains_in_mjx_are_compiled_without_fusion_emitters():
+    assert train.compiler_options(make_chain(6)) == {train.FUSION_EMITTERS: False}
+    assert train.compiler_options(make_chain(2)) == {}
+    assert train.compiler_options(make_chain(6, engine="mujoco")) == {}
+
+
+def test_the_users_own_flag_is_left_alone(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", f"--{train.FUSION_EMITTERS}=true")
+    assert train.compiler_options(make_chain(6)) == {}
+
+
+def test_an_option_that_xla_does_not_know_is_not_used(monkeypatch):
+    assert train.is_known_option(train.FUSION_EMITTERS)
+    assert not train.is_known_option("xla_cpu_option_that_is_gone")
+    monkeypatch.setattr(train, "FUSION_EMITTERS", "xla_cpu_option_that_is_gone")
+    assert train.compiler_options(make_chain(6)) == {}
