@@ -46,7 +46,7 @@ class BraxEnv(brax.envs.base.Env):
     def step(self, state: brax.envs.base.State, action: jax.Array) -> brax.envs.base.State:
         """Take one control step; `done` says only that the task ended it."""
         step_key, key = jax.random.split(jax.random.wrap_key_data(state.info[KEY]))
-        sent = self._middle + self._half_range * action
+        sent = jnp.asarray(self._middle) + self._half_range * action
         result = self.env.step(self.sys, _any(state.pipeline_state), sent, step_key)
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=result.state,
@@ -103,7 +103,7 @@ def brax_on_new_jax() -> Iterator[None]:
             setattr(jax, name, before)
 
 
-def _device_put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
+def _device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """Put a copy of every leaf on every device: [...] to [devices, ...], split along the first."""
     # The name is that of Brax's own pmap axis: JAX lets one program mix no two meshes.
     sharding = NamedSharding(Mesh(np.asarray(devices), ("i",)), PartitionSpec("i"))

@@ -1,0 +1,223 @@
+"""The host loop with tiny learners: resume, stop on NaN, stop when solved, compiler options."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+from garat_jax import checkpoint, dynamics, train
+from garat_jax.errors import DivergedError
+from garat_jax.runs import RunDirectory
+from garat_jax.train import Trainer, UntilSolved
+from tests.models import PENDULUM, spec
+
+SEEDS = [7, 8]
+CHAIN = "<mujoco><worldbody>{}</worldbody></mujoco>"
+LINK = '<body pos="0 0 0.1"><joint axis="0 1 0"/><geom size="0.05"/>{}</body>'
+
+
+class Interrupting(RunDirectory):
+    """A run that is interrupted once: before or after the metrics of a step are written."""
+
+    interrupt_at = 3
+    metrics_first = True
+
+    def log(self, step, **metrics):
+        if self.metrics_first or step != self.interrupt_at:
+            super().log(step, **metrics)
+        if step == self.interrupt_at:
+            raise KeyboardInterrupt
+
+
+class InterruptedEarly(Interrupting):
+    metrics_first = False
+
+
+def directory(path, cls=RunDirectory, resume=False):
+    return cls.create(path, {"what": "test"}, "garat test", SEEDS, resume=resume)
+
+
+def trainer(run: RunDirectory) -> Trainer:
+    return Trainer(run, SEEDS, console=Console(quiet=True))
+
+
+def learner():
+    """Return a random walk's step and start, one walker a seed."""
+
+    def step(state, params):
+        position, key = state
+        key, draw = jax.random.split(key)
+        position = position * 0.9 + params * jax.random.normal(draw, position.shape)
+        return (position, key), {"mean": position.mean()}
+
+    keys = jax.vmap(jax.random.key)(jnp.asarray(SEEDS))
+    return jax.vmap(step, (0, None)), (jnp.zeros((2, 3)), keys)
+
+
+def lines(run: RunDirectory) -> list:
+    return list(run.metrics())
+
+
+def assert_same_state(one, other):
+    jax.tree.map(
+        np.testing.assert_array_equal, (one[0], *map(jax.random.key_data, one[1:])),
+        (other[0], *map(jax.random.key_data, other[1:])),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", [Interrupting, InterruptedEarly])
+def test_interrupted_and_resumed_is_uninterrupted_bit_for_bit(tmp_path, kind):
+    step, start = learner()
+    whole = directory(tmp_path / "whole")
+    expected = trainer(whole).train("walk", step, start, 0.1, 6)
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(directory(tmp_path / "cut", kind)).train("walk", step, start, 0.1, 6)
+    cut = directory(tmp_path / "cut", resume=True)
+    assert checkpoint.latest_step(cut.path("checkpoints/walk")) == 2
+    resumed = trainer(cut).train("walk", step, start, 0.1, 6)
+
+    assert_same_state(resumed, expected)
+    assert lines(cut) == lines(whole)
+    assert [line["step"] for line in lines(whole)] == [1, 2, 3, 4, 5, 6]
+    assert all(len(line["mean"]) == 2 for line in lines(whole))
+
+
+def test_a_stage_that_is_over_is_not_run_again(tmp_path):
+    step, start = learner()
+    first = trainer(directory(tmp_path / "run")).train("walk", step, start, 0.1, 3)
+
+    def never(state, params):
+        raise AssertionError("the stage was over")
+
+    again = directory(tmp_path / "run", resume=True)
+    assert_same_state(trainer(again).train("walk", never, start, 0.1, 3), first)
+    assert len(lines(again)) == 3
+
+
+def test_stages_keep_apart_what_they_leave(tmp_path):
+    step, start = learner()
+    loop = trainer(directory(tmp_path / "run"))
+    state = loop.train("first", step, start, 0.1, 2)
+    loop.train("second", step, state, 0.1, 1)
+    assert [(x["stage"], x["step"]) for x in lines(loop.run)] == [
+        ("first", 1), ("first", 2), ("second", 1),
+    ]  # fmt: skip
+    assert_same_state(checkpoint.restore(loop.run.path("checkpoints/first"), start), state)
+    assert loop.seconds.compile > 0
+    assert loop.seconds.run > 0
+
+
+def diverging():
+    """Return a step in which the second learner becomes NaN at its third iteration."""
+
+    def step(state, params):
+        del params
+        count, weights = state["count"] + 1, state["weights"] + 0.5
+        bad = (count == 3) & (state["seed"] == SEEDS[1])
+        weights = jnp.where(bad, jnp.nan, weights)
+        return state | {"count": count, "weights": weights}, {"loss": weights.sum()}
+
+    start = {
+        "seed": jnp.asarray(SEEDS),
+        "count": jnp.zeros(2, jnp.int32),
+        "weights": jnp.zeros((2, 3)),
+        "key": jax.vmap(jax.random.key)(jnp.asarray(SEEDS)),
+    }
+    return jax.vmap(step, (0, None)), start
+
+
+def test_nan_stops_the_run_and_says_where(tmp_path):
+    step, start = diverging()
+    run = directory(tmp_path / "run")
+    with pytest.raises(DivergedError) as error:
+        trainer(run).train("fall", step, start, None, 10)
+    message = str(error.value)
+    assert "seed 8" in message
+    assert "iteration 3" in message
+    assert "seed 7" not in message
+
+    folder = run.path("checkpoints/fall")
+    assert checkpoint.latest_step(folder) == 2
+    np.testing.assert_array_equal(checkpoint.restore(folder, start)["weights"], np.full((2, 3), 1))
+    with np.load(run.root / "diverged" / "fall-3.npz", allow_pickle=False) as offending:
+        weights = offending["['weights']"]
+    assert np.isnan(weights[1]).all()
+    np.testing.assert_array_equal(weights[0], [1.5, 1.5, 1.5])
+    assert str(run.root / "diverged" / "fall-3.npz") in message
+    assert [line["step"] for line in lines(run)] == [1, 2]
+
+
+def test_a_metric_that_is_not_finite_stops_the_run_too(tmp_path):
+    def step(state, params):
+        return state + 1, {"loss": jnp.log(2.5 - state)}
+
+    with pytest.raises(DivergedError, match=r"seed 7, 8 .* iteration 4"):
+        trainer(directory(tmp_path / "run")).train("log", step, jnp.zeros(2), None, 10)
+
+
+def climber(solved_return: float):
+    """Return a learner whose score is its height, which goes up by 1 a step."""
+
+    def step(height, params):
+        return height + params, {"height": height + params}, "transitions"
+
+    def evaluate(height, params, key):
+        del params, key
+        return height
+
+    return jax.vmap(train.until_solved(step, evaluate, solved_return), (0, None))
+
+
+def climbers(*heights: float) -> UntilSolved:
+    count = len(heights)
+    keys = jax.random.split(jax.random.key(0), count)
+    return UntilSolved(jnp.asarray(heights), jnp.zeros(count, bool), keys)
+
+
+def test_a_seed_that_has_solved_its_task_stays_as_it_is(tmp_path):
+    loop = trainer(directory(tmp_path / "run"))
+    state = loop.train("climb", climber(3.0), climbers(0.0, 1.5), 1.0, 10)
+    np.testing.assert_array_equal(state.state, [3.0, 3.5])  # not 4.5
+    assert [line["finished"] for line in lines(loop.run)] == [
+        [False, False], [False, True], [True, True],
+    ]  # fmt: skip
+
+
+def test_without_a_solution_the_iterations_run_out(tmp_path):
+    loop = trainer(directory(tmp_path / "run"))
+    state = loop.train("climb", climber(99.0), climbers(0.0, 1.0), 1.0, 4)
+    np.testing.assert_array_equal(state.state, [4.0, 5.0])
+    assert not state.solved.any()
+
+
+def world(depth: int, engine: str):
+    mjcf = ""
+    for _ in range(depth):
+        mjcf = LINK.format(mjcf)
+    return dynamics.compile(spec(CHAIN.format(mjcf)), engine=engine)
+
+
+def test_compiler_options_are_for_deep_chains_in_mjx_on_a_cpu(monkeypatch):
+    flag = {"xla_cpu_use_fusion_emitters": False}
+    deep, shallow = world(6, "mjx"), world(2, "mjx")
+    assert (train.chain_depth(deep), train.chain_depth(shallow)) == (6, 2)
+    on_cpu = flag if jax.default_backend() == "cpu" else {}
+    assert train.compiler_options(deep) == on_cpu
+    assert train.compiler_options(shallow) == {}
+    assert train.compiler_options(world(6, "mujoco")) == {}
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert train.compiler_options(deep) == {}
+
+
+def test_the_compiler_takes_its_options_or_the_run_stops_here():
+    loop = trainer(run=None)  # pyright: ignore[reportArgumentType]; `call` writes nothing
+    options = train.compiler_options(world(6, "mjx"))
+    assert loop.call(lambda x: x + 1, jnp.ones(3), options=options).sum() == 6
+
+
+def test_chain_depth_counts_dofs_of_the_longest_branch():
+    pair = CHAIN.format(LINK.format("") + LINK.format(LINK.format("")))
+    assert train.chain_depth(dynamics.compile(spec(pair), engine="mujoco")) == 2
+    assert train.chain_depth(dynamics.compile(spec(PENDULUM), engine="mujoco")) == 1
