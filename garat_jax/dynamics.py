@@ -6,6 +6,7 @@ Effects reach both in the same two ways: as native model fields and as commands 
 forces.
 """
 
+import copy
 import dataclasses
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from flax import struct
 
 from garat_jax._mjx import mjx
@@ -201,6 +203,21 @@ def view(dynamics: Dynamics) -> ModelView:
     model = ModelView(dynamics.host.model, read)
     for effect in dynamics.effects:
         model = model.replace(effect.fields(model))
+    return model
+
+
+def native_model(dynamics: Dynamics) -> mujoco.MjModel:
+    """Return a MuJoCo model with the native fields of the effects written into it.
+
+    What effects do to commands and by forces is not in it: no MuJoCo field says that.
+    """
+    model = copy.copy(dynamics.host.model)
+    changed = view(dynamics).changed
+    for name, value in changed.items():
+        owner, _, field = name.rpartition(".")
+        getattr(model.opt if owner else model, field)[...] = np.asarray(value)
+    if CONSTANT_INPUTS & changed.keys():
+        mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 

@@ -217,3 +217,16 @@ def test_a_bad_state_stays_bad_in_both_engines():
         world = compiled(PENDULUM, engine=engine)
         state = dynamics.initial_state(world, jnp.full(1, jnp.nan), jnp.zeros(1))
         assert np.isnan(dynamics.step(world, state, jnp.zeros(1)).qpos).all()
+
+
+def test_the_native_model_is_what_the_engine_steps():
+    effects = (PayloadMass("body/forearm", mass=0.5, x=0.3), make("viscous_damping"))
+    world = compiled(ARM, *effects, engine="mujoco")
+    model = dynamics.native_model(world)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = 0.3, [-0.5, 0.5]
+    state = dynamics.initial_state(world, jnp.asarray(data.qpos), jnp.asarray(data.qvel))
+    mujoco.mj_step(model, data, 5)
+    state = dynamics.step(world, state, jnp.zeros(model.nu), 5)
+    np.testing.assert_allclose(state.qpos, data.qpos, rtol=1e-9)
+    assert dynamics.view(world).host.body("forearm_payload").mass[0] < 1e-8

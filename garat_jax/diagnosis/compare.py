@@ -18,6 +18,7 @@ from garat_jax.diagnosis.rank import ABOVE_FLOOR, Floor, make_metric, noise_floo
 from garat_jax.diagnosis.replay import Replay, Size, replay_with
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.simulate import Simulator, choose_grid
+from garat_jax.dynamics import native_model
 from garat_jax.provenance import versions
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
 
@@ -81,7 +82,7 @@ def compare(
     """
     started = time.monotonic()
     recordings = thin(recordings)
-    host = model.compile(engine="mujoco").host.model
+    host = native_model(model.compile(engine="mujoco"))
     grid = choose_grid(recordings, host.opt.timestep)
     simulator = Simulator(model, (), grid)
     say("choosing the horizon")
@@ -124,7 +125,7 @@ def run_compare(model: Path, data: Sequence[Path], run: RunDirectory) -> Compari
 
 def read_recordings(model: Model, paths: Sequence[Path]) -> list[Recording]:
     """Read recordings of a model and tell their warnings."""
-    host = model.compile(engine="mujoco").host.model
+    host = native_model(model.compile(engine="mujoco"))
     recordings = [Recording.read(path, host) for path in paths]
     for recording in recordings:
         for warning in recording.warnings:

@@ -22,6 +22,7 @@ from garat_jax.diagnosis.simulate import (
     cut,
     nearby_starts,
 )
+from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE, Effect
 from garat_jax.provenance import versions
 
@@ -57,7 +58,7 @@ def diagnose(
     started = time.monotonic()
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
-    host = model.compile(engine="mujoco").host.model
+    host = native_model(model.compile(engine="mujoco"))
     candidates = make_candidates(model, host)
     grid = choose_grid(everything, host.opt.timestep)
     simulator = Simulator(model, candidates, grid)

@@ -11,6 +11,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
 from garat_jax.diagnosis.results import Candidate
+from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE
 
 HORIZONS = (0.2, 0.5, 1.0, 2.0)
@@ -62,7 +63,7 @@ def look(model: Model, recordings: Sequence[Recording], selected: Sequence[Candi
         selected: The effects that a diagnosis found.
     """
     recordings = thin(recordings)
-    host = model.compile(engine="mujoco").host.model
+    host = native_model(model.compile(engine="mujoco"))
     longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
     horizons = [h for h in HORIZONS if h <= longest] or [longest]
     before = replay(model, recordings, horizons)
