@@ -16,7 +16,7 @@ from garat_jax.diagnosis import convert
 from garat_jax.diagnosis.compare import read_recordings, tell
 from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.model_card import load_model
-from garat_jax.diagnosis.report import write_diagnosis
+from garat_jax.diagnosis.report import diagnosis_sections, write_diagnosis
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
 
 CASES = {
@@ -41,7 +41,8 @@ def run_case(name: str, folder: Path, out: Path, command: str) -> dict[str, Any]
     result = diagnose(model, fit, holdout, tell)
     run = RunDirectory.create(out / name / "diagnosis", {"case": name}, command, [], force=True)
     run.write_json("diagnosis.json", result.to_json())
-    write_diagnosis(run, result, model, fit, holdout)
+    sections = diagnosis_sections(result, model, fit, holdout)
+    write_diagnosis(run, result, model.name, sections)
     sys.stdout.write(f"{name}\n{result}\n\n")
     row = {
         "case": name,

@@ -5,16 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import mujoco
 from rich.console import Console
 
 from garat_jax import report, summary
 from garat_jax.diagnosis import run_diagnose
 from garat_jax.diagnosis.convert import free_pendulum
 from garat_jax.diagnosis.hidden import Hidden, make_recordings
-from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.model_card import load_model
-from garat_jax.diagnosis.report import diagnosis_sections
 from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.envs.pairs import PAIRS
 from garat_jax.presets import garat
@@ -38,6 +34,7 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
         UserError: The folder holds no such recordings.
     """
     console = Console(stderr=True)
+    real = free_pendulum(measurements, run.path("real_measurements")) if measurements else None
     console.rule("1. Transfer: ground the source in the target's data")
     config = dataclasses.replace(garat(PAIRS[PAIR]), first_seed=seed)
     seeds = range(seed, seed + config.seeds)
@@ -46,17 +43,16 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
     console.rule("2. A hidden effect: which physics does the model lack?")
     hidden = make_recordings(PENDULUM, run.path("measurements"), seed)
     part = _part(run, "diagnosis", {"model": PENDULUM}, [seed])
-    found = run_diagnose(PENDULUM, hidden.fit, hidden.holdout, part)
+    found, pages = run_diagnose(PENDULUM, hidden.fit, hidden.holdout, part)
     sections = [
         *_titled("Transfer", summary.sections(transfer, PAIRS[PAIR].summary)),
-        *_titled("Hidden effect", _with_truth(found, hidden)),
+        *_titled("Hidden effect", [*pages, _truth(found, hidden)]),
     ]
-    if measurements is not None:
+    if real is not None:
         console.rule("3. Real measurements: a pendulum that swings freely")
-        model, fit, holdout = free_pendulum(measurements, run.path("real_measurements"))
-        part = _part(run, "real", {"model": model}, [])
-        real = run_diagnose(model, fit, holdout, part)
-        sections += _titled("Real pendulum", _sections(real, model, fit, holdout))
+        part = _part(run, "real", {"model": real.model}, [])
+        pages = run_diagnose(real.model, real.fit, real.holdout, part).sections
+        sections += _titled("Real pendulum", pages)
     report.write(
         run.path("report.html"),
         title="What garat does with a simulator that is wrong",
@@ -79,26 +75,17 @@ def _titled(title: str, sections: Sequence[Section]) -> list[Section]:
     return [dataclasses.replace(s, heading=f"{title}: {s.heading}") for s in sections]
 
 
-def _sections(
-    found: Diagnosis, path: Path, fit: Sequence[Path], holdout: Sequence[Path]
-) -> list[Section]:
-    host = mujoco.MjModel.from_xml_path(str(path))
-    fitted, held_out = ([Recording.read(p, host) for p in paths] for paths in (fit, holdout))
-    return diagnosis_sections(found, load_model(path), fitted, held_out)
-
-
-def _with_truth(found: Diagnosis, hidden: Hidden) -> list[Section]:
-    """Put before the diagnosis what was recorded, and after it what was hidden."""
+def _truth(found: Diagnosis, hidden: Hidden) -> Section:
+    """Say what was hidden, and whether it was found."""
     sizes = ", ".join(f"{name} {value:.4g}" for name, value in hidden.parameters.items())
     named = [(c.effect, c.target) for c in found.selected]
     verdict = "found it" if named == [(hidden.kind, hidden.target)] else "did not find just that"
-    truth = Section(
+    return Section(
         "what was hidden",
         f"The recordings came from C MuJoCo at a 32 times finer timestep, with sensor noise and "
         f"{hidden.kind} at {hidden.target} ({sizes}). The diagnosis, which saw the recordings "
         f"alone, {verdict}.",
     )
-    return [*_sections(found, PENDULUM, hidden.fit, hidden.holdout), truth]
 
 
 def _facts(transfer: Mapping[str, Any], found: Diagnosis) -> list[Fact]:

@@ -30,28 +30,23 @@ NUM_SIGNALS = 4
 
 
 def write_diagnosis(
-    run: RunDirectory,
-    diagnosis: Diagnosis,
-    model: Model,
-    recordings: Sequence[Recording],
-    holdout: Sequence[Recording] = (),
+    run: RunDirectory, diagnosis: Diagnosis, name: str, sections: Sequence[Section]
 ) -> Path:
     """Write report.html of a diagnosis into its run directory.
 
     Args:
         run: The run directory.
         diagnosis: What was found.
-        model: The model as it was given.
-        recordings: The recordings that `diagnose` was given.
-        holdout: Those that it was given to hold out.
+        name: The model's name.
+        sections: What `diagnosis_sections` returned.
     """
     return report.write(
         run.path("report.html"),
         kind="What is missing in the model",
-        title=f"Diagnosis of {model.name}",
+        title=f"Diagnosis of {name}",
         lead=diagnosis_lead(diagnosis),
         facts=diagnosis_facts(diagnosis),
-        sections=diagnosis_sections(diagnosis, model, recordings, holdout),
+        sections=sections,
         reproduce=Reproduce.from_config(run.read_json("config.json")),
     )
 
@@ -95,7 +90,14 @@ def diagnosis_sections(
     recordings: Sequence[Recording],
     holdout: Sequence[Recording] = (),
 ) -> list[Section]:
-    """Return the sections of a diagnosis; see `write_diagnosis` for the arguments."""
+    """Return the sections of a diagnosis; they simulate what they show.
+
+    Args:
+        diagnosis: What was found.
+        model: The model as it was given.
+        recordings: The recordings that `diagnose` was given.
+        holdout: Those that it was given to hold out.
+    """
     fitted, held_out, _ = split(recordings, holdout)
     view = look(model, (*fitted, *held_out), diagnosis.selected)
     shown = range(len(fitted), len(view.recordings))

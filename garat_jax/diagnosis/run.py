@@ -2,20 +2,29 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.diagnose import diagnose, split
+from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.model_card import load_model
-from garat_jax.diagnosis.report import write_diagnosis
+from garat_jax.diagnosis.report import diagnosis_sections, write_diagnosis
 from garat_jax.diagnosis.results import Diagnosis
+from garat_jax.report import Section
 from garat_jax.runs import RunDirectory
+
+
+class Diagnosed(NamedTuple):
+    """A diagnosis, and the sections of its report."""
+
+    diagnosis: Diagnosis
+    sections: Sequence[Section]
 
 
 def run_diagnose(
     model: Path, data: Sequence[Path], holdout: Sequence[Path], run: RunDirectory
-) -> Diagnosis:
+) -> Diagnosed:
     """Diagnose a model file with recordings; write diagnosis.json and report.html into a run.
 
     Args:
@@ -33,6 +42,7 @@ def run_diagnose(
         diagnosis = diagnose(loaded, recordings, held_out, status.update)
         run.write_json("diagnosis.json", diagnosis.to_json())
         status.update("writing the report")
-        write_diagnosis(run, diagnosis, loaded, *split(recordings, held_out)[:2])
+        sections = diagnosis_sections(diagnosis, loaded, recordings, held_out)
+        write_diagnosis(run, diagnosis, loaded.name, sections)
     Console(highlight=False, markup=False, soft_wrap=True).print(str(diagnosis))
-    return diagnosis
+    return Diagnosed(diagnosis, sections)

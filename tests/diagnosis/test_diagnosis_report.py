@@ -8,7 +8,7 @@ import pytest
 from garat_jax.diagnosis import Diagnosis, Recording, load_model
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.localise import Place
-from garat_jax.diagnosis.report import diagnosis_lead, write_diagnosis
+from garat_jax.diagnosis.report import diagnosis_lead, diagnosis_sections, write_diagnosis
 from garat_jax.diagnosis.results import (
     Candidate,
     Errors,
@@ -92,7 +92,9 @@ def write(tmp_path, diagnosis) -> str:
     host = model.compile(engine="mujoco").host.model
     fit, holdout = ([Recording.read(p, host) for p in paths] for paths in (made.fit, made.holdout))
     run = RunDirectory.create(tmp_path / "run", {}, "garat diagnose pendulum.xml", [])
-    page = write_diagnosis(run, diagnosis, model, fit, holdout).read_text(encoding="utf-8")
+    page = write_diagnosis(
+        run, diagnosis, model.name, diagnosis_sections(diagnosis, model, fit, holdout)
+    ).read_text(encoding="utf-8")
     return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
 
 
