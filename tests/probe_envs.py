@@ -1,6 +1,7 @@
 """Small environments without physics; each can only be learned with one particular faculty."""
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -113,3 +114,36 @@ class AnyProbe(Probe):
     def step(self, params, state, action, key):
         steps = [partial(p.step, None) for p in PROBES.values()]
         return jax.lax.switch(params, steps, state, action, key)
+
+
+class WalkParams(NamedTuple):
+    """How strong actions are, and how far a walker is pushed at each step."""
+
+    gain: float | jax.Array
+    push: float | jax.Array = 0.0
+
+
+class Walk(Env):
+    """A point that moves by its action in [-2, 1], for at most 6 steps.
+
+    Beyond ±0.9 the episode terminates. The reward is the position.
+    """
+
+    obs_size = 1
+    action_low = np.full(1, -2.0)
+    action_high = np.full(1, 1.0)
+    episode_length = 6
+    limit = 0.9
+
+    def reset(self, params, key) -> EnvState:
+        del params
+        start = jax.random.uniform(key, (1,), minval=-0.1, maxval=0.1)
+        return EnvState(None, start, jnp.zeros((), jnp.int32))
+
+    def step(self, params, state, action, key) -> StepResult:
+        del key
+        obs = state.obs + params.gain * self.clip(action) + params.push
+        terminated = jnp.abs(obs[0]) > self.limit
+        steps = state.steps + 1
+        truncated = (steps >= self.episode_length) & ~terminated
+        return StepResult(EnvState(None, obs, steps), obs[0], terminated, truncated)

@@ -1,0 +1,151 @@
+"""The transfer experiment as a whole, tiny; and as a command that is interrupted."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from garat_jax import checkpoint
+from garat_jax.agents.trpo import TRPOConfig
+from garat_jax.envs.pairs import PAIRS
+from garat_jax.presets import garat
+from garat_jax.runs import RunDirectory
+from garat_jax.transfer import TransferConfig, run_transfer
+
+pytestmark = pytest.mark.slow  # a dozen programs to compile
+
+NAME = "inverted_pendulum_heavy"
+SEEDS = [0, 1]
+STAGES = [
+    "source policy",
+    "target policy",
+    "grounding",
+    "grounded policy",
+    "more source training",
+    "action noise",
+]
+
+
+def tiny() -> TransferConfig:
+    """Return settings under which every part runs and nothing is learned."""
+    preset = garat(PAIRS[NAME], seeds=len(SEEDS), engine="mujoco")
+    small = {"num_envs": 4, "num_steps": 16, "hidden": (8,)}
+    return dataclasses.replace(
+        preset,
+        agent=TRPOConfig(**small, cg_iterations=3, value_epochs=1, value_minibatch=32),
+        garat=dataclasses.replace(
+            preset.garat,
+            transformer=dataclasses.replace(
+                preset.garat.transformer, **small, num_epochs=1, num_minibatches=2
+            ),
+            hidden=(8,),
+            num_minibatches=2,
+        ),
+        max_iterations=2,
+        num_updates=2,
+        num_retraining=2,
+        num_target_transitions=40,
+        num_episodes=2,
+        num_solving_episodes=2,
+    )
+
+
+def directory(path: Path, resume: bool = False) -> RunDirectory:
+    return RunDirectory.create(path, {"pair": NAME}, "garat transfer", SEEDS, resume=resume)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    root = tmp_path_factory.mktemp("transfer") / "run"
+    return root, run_transfer(tiny(), directory(root))
+
+
+def test_it_leaves_a_summary_of_everything(finished):
+    root, result = finished
+    summary = json.loads((root / "summary.json").read_text())
+    assert summary == json.loads(json.dumps(result))
+    assert summary["format"] == "garat-transfer/1"
+    assert (summary["pair"], summary["method"], summary["seeds"]) == (NAME, "garat", SEEDS)
+    rows = {
+        "returns": ["source_policy", "target_policy", "method"],
+        "transition_error": ["source", "grounded", "zero_action"],
+    }
+    for group, names in rows.items():
+        for name in names:
+            assert np.isfinite(summary[group][name]).all()
+            assert len(summary[group][name]) == len(SEEDS)
+    assert summary["scaled"].keys() == {"mean", "standard_error", "per_seed"}
+    assert summary["controls"].keys() == {"more_source_training", "action_noise"}
+    assert summary["target_transitions"] == 40
+    assert summary["seconds"]["compile"] > 0
+    assert summary["seconds"]["run"] > 0
+
+
+def test_env_steps_count_what_each_policy_saw(finished):
+    _, result = finished
+    steps = {name: set(value) for name, value in result["env_steps"].items()}
+    assert steps["source_policy"] == steps["target_policy"] == {2 * 64}
+    assert steps["method"] == steps["action_noise"] == {4 * 64}
+    assert steps["grounding"] == {2 * 64}
+
+
+def test_it_leaves_a_report_checkpoints_and_metrics(finished):
+    root, result = finished
+    assert NAME in (root / "report.html").read_text(encoding="utf-8")
+    for stage in STAGES:
+        assert checkpoint.latest_step(root / "checkpoints" / stage) == 2, stage
+    lines = [json.loads(line) for line in (root / "metrics.jsonl").read_text().splitlines()]
+    assert {line["stage"] for line in lines} == set(STAGES)
+    errors = [line["error"] for line in lines if line["stage"] == "grounding"]
+    assert result["transition_error_curve"] == {"update": [1, 2], "grounded": errors}
+    np.testing.assert_allclose(errors[-1], result["transition_error"]["grounded"], rtol=1e-4)
+
+
+def test_a_finished_run_resumed_gives_the_same_numbers(finished):
+    root, result = finished
+    again = run_transfer(tiny(), directory(root, resume=True))
+    assert {**again, "seconds": None} == {**result, "seconds": None}
+
+
+def start_command(out: Path, *options: str) -> subprocess.Popen[str]:
+    program = "import sys; from garat_jax.cli import main; sys.exit(main())"
+    arguments = ["transfer", NAME, "--seeds", "1", "--engine", "mujoco", "--out", str(out)]
+    return subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", program, *arguments, *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "COLUMNS": "500"},
+    )
+
+
+def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 120
+    while not path.exists() or path.read_text().count("\n") < count:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "the run logged nothing"
+        time.sleep(0.05)
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path):
+    out = tmp_path / "run"
+    process = start_command(out)
+    try:
+        wait_for_lines(out / "metrics.jsonl", 2, process)
+        process.send_signal(signal.SIGINT)
+        _, complaint = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    last = complaint.splitlines()[-1]
+    assert process.returncode == 130, complaint
+    assert last.startswith("garat: interrupted; go on with: garat transfer ")
+    assert last.endswith("--resume")
+    assert "Traceback" not in complaint
+    assert (checkpoint.latest_step(out / "checkpoints" / "source policy") or 0) >= 1

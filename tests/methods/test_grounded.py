@@ -1,0 +1,133 @@
+"""The two views of an environment that make grounding."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from garat_jax import rollout
+from garat_jax.methods.grounded import (
+    GroundedEnv,
+    Grounding,
+    TransformerEnv,
+    TransformerParams,
+    decode_action,
+)
+from garat_jax.methods.transition_error import CONSTANT_ACTIONS, constant_errors, transition_error
+from tests.probe_envs import Walk, WalkParams
+
+ENV = Walk()  # actions from -2 to 1: middle -0.5, half-range 1.5
+GAIN = 0.2
+PARAMS = WalkParams(GAIN)
+
+
+def start():
+    return ENV.reset(PARAMS, jax.random.key(0))
+
+
+def uniform(params, obs, key):
+    """Act at random beyond the bounds; `params` shifts the action."""
+    del obs
+    return params + jax.random.uniform(key, (1,), minval=-3, maxval=3), jnp.zeros(())
+
+
+def test_grounded_by_the_identity_is_the_environment_itself():
+    grounded = GroundedEnv(ENV, lambda params, obs, action, key: action)
+    params = Grounding(PARAMS, ())
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        rollout.record(grounded, params, uniform, 0.0, jax.random.key(1), 3, 8).transitions,
+        rollout.record(ENV, PARAMS, uniform, 0.0, jax.random.key(1), 3, 8).transitions,
+    )
+
+
+def test_a_transformer_sees_what_is_seen_and_the_clipped_action():
+    def transform(params, obs, action, key):
+        del key
+        return params * action + obs
+
+    grounded = GroundedEnv(ENV, transform)
+    result = grounded.step(Grounding(PARAMS, 0.5), start(), jnp.asarray([7.0]), jax.random.key(2))
+    obs = start().obs
+    np.testing.assert_allclose(result.state.obs, obs + GAIN * (0.5 * 1.0 + obs))
+    assert (grounded.obs_size, grounded.action_size, grounded.episode_length) == (1, 1, 6)
+
+
+def transformer_env():
+    def reward(params, obs, action, next_obs):
+        return (params * jnp.asarray([obs[0], action[0], next_obs[0]])).sum()
+
+    return TransformerEnv(ENV, uniform, lambda action, output: 0.1 * action + output, reward)
+
+
+def test_the_transformer_is_shown_the_agents_view_and_action():
+    env = transformer_env()
+    params = TransformerParams(PARAMS, 0.0, jnp.zeros(3))
+    states = rollout.reset(env, params, jax.random.key(0), 50)
+    obs, action = env.split(states.obs)
+    assert (env.obs_size, obs.shape, action.shape) == (2, (50, 1), (50, 1))
+    assert np.abs(obs).max() <= 0.1
+    assert (action.min(), action.max()) == (-2, 1)  # the agent's wishes, clipped
+    assert len(np.unique(action)) > 20
+
+
+@pytest.mark.parametrize("which", range(3))
+def test_the_transformer_is_paid_for_obs_the_agents_action_and_what_followed(which):
+    env = transformer_env()
+    params = TransformerParams(PARAMS, 0.0, jnp.eye(3)[which])
+    state = env.reset(params, jax.random.key(3))
+    obs, action = env.split(state.obs)
+    result = env.step(params, state, jnp.asarray([0.4]), jax.random.key(4))
+    sent = 0.1 * action + 0.4
+    assert result.reward == pytest.approx([obs, action, obs + GAIN * sent][which].item(), abs=1e-6)
+    np.testing.assert_allclose(env.split(result.state.obs)[0], obs + GAIN * sent, rtol=1e-6)
+    assert env.split(result.state.obs)[1] != action
+
+
+def test_the_agents_parameters_reach_the_agent():
+    params = TransformerParams(PARAMS, 100.0, jnp.zeros(3))
+    state = transformer_env().reset(params, jax.random.key(0))
+    assert state.obs[1] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("output_is", "reach", "action", "output", "sent"),
+    [
+        ("change", 1.0, 0.0, 0.5, 0.75),
+        ("change", 1.0, 0.0, -9.0, -1.5),  # the output is clipped
+        ("change", 2.0, 1.0, -0.5, -0.5),
+        ("change", 1.0, 0.5, 1.0, 1.0),  # and so is the action
+        ("absolute", 1.0, 0.3, 0.0, -0.5),
+        ("absolute", 1.0, 0.3, 1.0, 1.0),
+        ("absolute", 1.0, 0.3, -1.0, -2.0),
+        ("absolute", 0.5, 0.3, 1.0, 0.25),
+    ],
+)
+def test_decoding(output_is, reach, action, output, sent):
+    decode = decode_action(ENV, output_is, reach)
+    assert decode(jnp.asarray([action]), jnp.asarray([output])) == pytest.approx(sent)
+
+
+def test_unbounded_actions_are_refused():
+    with pytest.raises(ValueError, match="bounded actions: give actuators a ctrlrange"):
+        decode_action(transformer_env(), "change", 1.0)
+
+
+def test_transition_error_is_the_mean_distance():
+    recorded = rollout.record(ENV, PARAMS, uniform, 0.0, jax.random.key(5), 4, 7)
+    size = np.abs(ENV.clip(recorded.transitions.action)).mean()
+    assert transition_error(ENV, PARAMS, recorded) < 1e-7
+    assert transition_error(ENV, WalkParams(GAIN / 2), recorded) == pytest.approx(
+        0.1 * size, rel=1e-5
+    )
+
+
+def test_constant_errors_try_the_whole_range_and_zero_action_is_among_the_baselines():
+    def still(params, obs, key):
+        del params, obs, key
+        return jnp.zeros(1), jnp.zeros(())
+
+    recorded = rollout.record(ENV, PARAMS, still, (), jax.random.key(6), 2, 5)
+    errors = constant_errors(ENV, PARAMS, recorded)
+    actions = np.linspace(-2, 1, CONSTANT_ACTIONS)
+    np.testing.assert_allclose(errors, 0.2 * np.abs(actions), atol=1e-6)

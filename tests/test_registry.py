@@ -1,0 +1,113 @@
+"""Everything that has a name exists, is described, and can be made."""
+
+import ast
+import importlib
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from garat_jax import cli, dynamics
+from garat_jax.effects import CATALOGUE
+from garat_jax.env import make_world
+from garat_jax.envs import ENVS
+from garat_jax.envs.pairs import PAIRS
+from garat_jax.methods.garat import GARAT
+from garat_jax.presets import METHODS
+from tests.models import ARM, spec
+
+ENGINES = pytest.mark.parametrize("engine", ["mujoco", "mjx"])
+
+
+def first_step(world):
+    """Return what an environment gives at its first step under full action."""
+
+    def step(key):
+        state = world.env.reset(world.params, key)
+        high = jnp.where(jnp.isfinite(world.env.action_high), world.env.action_high, 1.0)
+        return state, world.env.step(world.params, state, high, key)
+
+    return jax.jit(step)(jax.random.key(0))
+
+
+@ENGINES
+@pytest.mark.parametrize("name", ENVS)
+def test_every_environment_steps(name, engine):
+    world = make_world(ENVS[name](), engine=engine)
+    state, result = first_step(world)
+    assert state.obs.shape == result.state.obs.shape == (world.env.obs_size,)
+    assert np.isfinite(result.state.obs).all()
+    assert np.isfinite(result.reward)
+    assert not np.array_equal(result.state.obs, state.obs)
+    assert result.terminated.dtype == result.truncated.dtype == bool
+    assert result.state.steps == 1
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_every_pair_has_two_worlds_that_differ(name):
+    pair = PAIRS[name]
+    assert pair.name == name
+    assert pair.summary
+    source, target = (
+        make_world(pair.task, overrides, engine="mujoco")
+        for overrides in (pair.source, pair.target)
+    )
+    (start, in_source), (same_start, in_target) = first_step(source), first_step(target)
+    np.testing.assert_array_equal(start.obs, same_start.obs)
+    assert np.abs(in_source.state.obs - in_target.state.obs).max() > 1e-4
+    assert source.env.obs_size == target.env.obs_size
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_every_effect_can_be_added_wherever_it_says(name):
+    kind = CATALOGUE[name]
+    targets = kind.targets(spec(ARM).compile())
+    assert targets
+    for target in targets:
+        world = dynamics.compile(spec(ARM), effects=(kind(target),), engine="mujoco")
+        assert world.effects[0].target == target
+    for parameter in kind.parameters():
+        assert parameter.low <= parameter.nominal <= parameter.high
+        assert parameter.scale > 0
+        assert parameter.source
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+@pytest.mark.parametrize("name", METHODS)
+def test_every_preset_fits_every_pair(name, pair):
+    config = METHODS[name](PAIRS[pair], seeds=3, engine="mujoco")
+    assert (config.method, config.seeds, config.pair, config.engine) == (
+        name, 3, PAIRS[pair], "mujoco",
+    )  # fmt: skip
+    source = make_world(config.pair.task, config.pair.source, engine="mujoco")
+    GARAT(source.env, lambda params, obs, key: (obs[:1], key), config.garat)
+    assert config.agent.num_envs * config.agent.num_steps >= config.agent.value_minibatch
+    assert config.num_target_transitions % config.agent.num_envs == 0
+
+
+@pytest.mark.parametrize("registry", [ENVS, CATALOGUE, METHODS], ids=["env", "effect", "method"])
+def test_every_entry_says_what_it_is(registry):
+    for name, entry in registry.items():
+        assert (inspect.getdoc(entry) or "").strip(), f"{name} has no docstring"
+
+
+@pytest.mark.parametrize(
+    ("command", "registries"), [("list", (ENVS, PAIRS, METHODS)), ("effects", (CATALOGUE,))]
+)
+def test_garat_prints_every_name(command, registries, capsys):
+    assert cli.main([command]) == 0
+    printed = capsys.readouterr().out
+    for registry in registries:
+        assert all(name in printed for name in registry)
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_finds_what_it_imports_late(name):
+    source = inspect.getsource(cli.COMMANDS[name])
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom):
+            module = importlib.import_module(str(node.module))
+            for alias in node.names:
+                assert callable(getattr(module, alias.name)) or getattr(module, alias.name)

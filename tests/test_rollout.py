@@ -1,0 +1,103 @@
+"""Experience as it was: nothing after a reset leaks into the step before it."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from garat_jax import rollout
+from garat_jax.dynamics import Override
+from garat_jax.env import make_world
+from garat_jax.envs.inverted_pendulum import InvertedPendulum
+from tests.probe_envs import Walk, WalkParams
+
+GAIN = 0.2
+PARAMS = WalkParams(GAIN)
+
+
+def constant(params, obs, key):
+    """Return the action `params`, whatever is seen."""
+    del obs, key
+    return params[None], jnp.zeros(())
+
+
+def uniform(params, obs, key):
+    del params, obs
+    return jax.random.uniform(key, (1,), minval=-3, maxval=3), jnp.asarray(-jnp.log(6.0))
+
+
+@partial(jax.jit, static_argnums=1)
+def walk(action, length):
+    """Return where 3 walkers stand after `length` steps, and the transitions, [length, 3]."""
+    state = rollout.reset(Walk(), PARAMS, jax.random.key(0), 3)
+    return rollout.unroll(Walk(), PARAMS, constant, action, state, jax.random.key(1), length)
+
+
+@pytest.mark.parametrize(("action", "steps"), [(0.0, 6), (1.0, 5)])
+def test_next_obs_is_what_followed_even_where_an_episode_ended(action, steps):
+    _, transitions = walk(action, 13)
+    np.testing.assert_allclose(
+        transitions.next_obs, transitions.obs + GAIN * action, rtol=1e-6, atol=1e-7
+    )
+    ended = np.asarray(transitions.terminated | transitions.truncated)
+    first = int(np.argmax(ended[:, 0]))
+    assert first == steps - 1
+    assert np.abs(transitions.obs[first + 1]).max() <= 0.1  # a new episode
+    assert len(np.unique(transitions.obs[[0, 6], 0])) == 2  # that starts elsewhere
+
+
+@pytest.mark.parametrize(("action", "terminates"), [(0.0, False), (1.0, True)])
+def test_the_end_of_the_task_and_the_end_of_time_are_kept_apart(action, terminates):
+    _, transitions = walk(action, 13)
+    assert not (transitions.terminated & transitions.truncated).any()
+    assert bool(transitions.terminated.any()) == terminates
+    assert bool(transitions.truncated.any()) != terminates
+
+
+def test_an_unroll_goes_on_where_the_last_one_stopped():
+    state, first = walk(1.0, 3)
+    np.testing.assert_array_equal(state.obs, first.next_obs[-1])
+    np.testing.assert_array_equal(state.steps, [3, 3, 3])
+
+
+def test_evaluate_counts_only_the_first_episode():
+    env, key = Walk(), jax.random.key(4)
+    returns = rollout.evaluate(env, PARAMS, constant, jnp.asarray(1.0), key, 5)
+    start = rollout.reset(env, PARAMS, jax.random.split(key)[0], 5).obs[:, 0]
+    positions = start[:, None] + GAIN * jnp.arange(1, 7)
+    alive = jnp.concatenate([jnp.ones((5, 1)), positions[:, :-1] <= Walk.limit], axis=1)
+    expected = (positions * jnp.cumprod(alive, axis=1)).sum(axis=1)
+    np.testing.assert_allclose(returns, expected, rtol=1e-5)
+    assert alive.min() == 0  # the episodes did end early
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Transitions of a pendulum, [20, 3], in which poles fall."""
+    world = make_world(InvertedPendulum(), engine="mujoco")
+    record = jax.jit(lambda key: rollout.record(world.env, world.params, uniform, (), key, 3, 20))
+    return world, record(jax.random.key(0))
+
+
+def test_recorded_states_are_those_the_steps_began_in(recorded):
+    _, data = recorded
+    np.testing.assert_array_equal(
+        data.transitions.obs,
+        jnp.concatenate([data.states.physics.qpos, data.states.physics.qvel], axis=-1),
+    )
+    assert data.transitions.terminated.any()
+    assert np.abs(data.transitions.action).max() <= 3
+
+
+def test_replay_in_the_same_world_is_exact_and_in_another_is_not(recorded):
+    world, data = recorded
+    wanted = data.transitions.next_obs.reshape(-1, 4)
+    heavy = make_world(InvertedPendulum(), (Override("body", "pole", "mass", 50.0),), (), "mujoco")
+    same, other = (
+        jax.jit(partial(rollout.replay, w.env))(w.params, data, jax.random.key(9))
+        for w in (world, heavy)
+    )
+    np.testing.assert_array_equal(same, wanted)
+    assert np.abs(other - wanted).max(axis=1).min() > 1e-5
