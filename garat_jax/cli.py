@@ -4,11 +4,12 @@ Each command is a frozen dataclass: its docstrings are the help, its `run` does 
 anything that loads JAX stand inside `run`, so that help and errors come at once.
 """
 
+import contextlib
 import dataclasses
 import inspect
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
@@ -58,8 +59,8 @@ class Demo:
             raise UserError(f"--measurements: there is no folder {self.measurements}")
         from garat_jax.demo import run_demo
 
-        run = make_run(self, self.out, seeds=[self.seed])
-        run_demo(run, seed=self.seed, measurements=self.measurements)
+        with make_run(self, self.out, seeds=[self.seed]) as run:
+            run_demo(run, seed=self.seed, measurements=self.measurements)
         say(f"report: {run.root / 'report.html'}")
 
 
@@ -97,8 +98,8 @@ class Transfer:
             choose("pair", self.pair, PAIRS), seeds=self.seeds, engine=self.engine
         )
         out = self.out or Path("runs") / f"{self.pair}-{self.method}"
-        run = make_run(self, out, seeds=range(self.seeds), resume=self.resume)
-        run_transfer(config, run)
+        with make_run(self, out, seeds=range(self.seeds), resume=self.resume) as run:
+            run_transfer(config, run)
         say(f"report: {run.root / 'report.html'}")
 
 
@@ -122,8 +123,8 @@ class Compare:
         from garat_jax.diagnosis import run_compare
 
         out = self.out or Path("runs") / f"compare-{self.model.stem}"
-        run = make_run(self, out)
-        run_compare(self.model, self.data, run)
+        with make_run(self, out) as run:
+            run_compare(self.model, self.data, run)
         say(f"report: {run.root / 'report.html'}")
 
 
@@ -150,8 +151,8 @@ class Diagnose:
         from garat_jax.diagnosis import run_diagnose
 
         out = self.out or Path("runs") / f"diagnose-{self.model.stem}"
-        run = make_run(self, out)
-        run_diagnose(self.model, self.data, self.holdout, run)
+        with make_run(self, out) as run:
+            run_diagnose(self.model, self.data, self.holdout, run)
         say(f"report: {run.root / 'report.html'}")
 
 
@@ -246,16 +247,19 @@ def say(message: str) -> None:
     Console(soft_wrap=True, highlight=False, markup=False).print(message)
 
 
+@contextlib.contextmanager
 def make_run(
-    command: Any, out: Path, seeds: Sequence[int] = (), resume: bool = False
-) -> "RunDirectory":
+    command: Any, out: Path, seeds: Sequence[int] = (), resume: bool | None = None
+) -> Iterator["RunDirectory"]:
     """Make the run directory of a command; the command's fields are the run's config.
+
+    Wrong input that shows only within the block leaves no empty run behind.
 
     Args:
         command: A command with a field `force`.
         out: The folder.
         seeds: The seeds of the run.
-        resume: Go on with the run that the folder holds.
+        resume: Go on with the run that the folder holds; None if the command cannot.
     """
     from garat_jax.runs import RunDirectory
 
@@ -265,7 +269,12 @@ def make_run(
         if field.name not in ("out", "force", "resume")
     }
     line = shlex.join([PROGRAM, *sys.argv[1:]])
-    return RunDirectory.create(out, config, line, seeds, force=command.force, resume=resume)
+    run = RunDirectory.create(out, config, line, seeds, force=command.force, resume=resume)
+    try:
+        yield run
+    except UserError:
+        run.discard()
+        raise
 
 
 def check_files(paths: Sequence[Path], what: str) -> None:

@@ -44,7 +44,7 @@ class RunDirectory:
         seeds: Sequence[int],
         *,
         force: bool = False,
-        resume: bool = False,
+        resume: bool | None = False,
     ) -> "RunDirectory":
         """Make a run directory and write its `config.json`, or go on with one that exists.
 
@@ -55,6 +55,7 @@ class RunDirectory:
             seeds: The seeds of the run.
             force: Replace the folder if it holds an earlier run.
             resume: Go on with the run that the folder holds; start one if it is absent or empty.
+                None if the command cannot go on with a run.
 
         Raises:
             UserError: The folder is not empty and neither `force` nor `resume` was given, it holds
@@ -72,9 +73,9 @@ class RunDirectory:
                 _check_same_run(root, record)
                 return cls(root, resumed=True)
             if not force:
+                go_on = "" if resume is None else "--resume to go on, "
                 raise UserError(
-                    f"{root} exists already: give --force to replace it, --resume to go on, "
-                    "or another --out"
+                    f"{root} exists already: give --force to replace it, {go_on}or another --out"
                 )
             _remove_run(root)
         try:
@@ -97,6 +98,12 @@ class RunDirectory:
         if not is_run(root):
             raise UserError(f"{root} holds no run: {CONFIG} of format {FORMAT!r} is not there")
         return cls(root, resumed=True)
+
+    def discard(self) -> None:
+        """Remove the folder if nothing came of the run: `config.json` is all that it holds."""
+        files = [path for path in self.root.rglob("*") if path.is_file()]
+        if not self.resumed and files == [self.root / CONFIG]:
+            shutil.rmtree(self.root)
 
     def path(self, name: str) -> Path:
         """Return the path of a file in the run, and make the folder that it belongs to."""

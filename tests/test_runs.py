@@ -171,3 +171,19 @@ def test_git_state_names_the_commit_of_this_tree(repository):
         pytest.skip("not a git checkout")
     state = git_state()
     assert state is None or (len(state["commit"]) == 40 and isinstance(state["dirty"], bool))
+
+
+def test_a_run_of_which_nothing_came_leaves_no_folder(tmp_path):
+    RunDirectory.create(tmp_path / "empty", {}, "garat", []).discard()
+    assert not (tmp_path / "empty").exists()
+    kept = RunDirectory.create(tmp_path / "kept", {}, "garat", [])
+    kept.log(1, reward=1.0)
+    kept.discard()
+    assert kept.path("metrics.jsonl").is_file()
+
+
+def test_a_command_that_cannot_resume_does_not_offer_it(tmp_path):
+    RunDirectory.create(tmp_path, {}, "garat", [])
+    with pytest.raises(UserError) as error:
+        RunDirectory.create(tmp_path, {}, "garat", [], resume=None)
+    assert "--resume" not in str(error.value)
