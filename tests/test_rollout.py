@@ -63,14 +63,14 @@ def test_an_unroll_goes_on_where_the_last_one_stopped():
 
 
 def test_evaluate_counts_only_the_first_episode():
-    env, key = Walk(), jax.random.key(4)
-    returns = rollout.evaluate(env, PARAMS, constant, jnp.asarray(1.0), key, 5)
-    start = rollout.reset(env, PARAMS, jax.random.split(key)[0], 5).obs[:, 0]
-    positions = start[:, None] + GAIN * jnp.arange(1, 7)
+    env, params, key = Walk(), WalkParams(0.5), jax.random.key(4)
+    returns = rollout.evaluate(env, params, constant, jnp.asarray(1.0), key, 5)
+    start = rollout.reset(env, params, jax.random.split(key)[0], 5).obs[:, 0]
+    positions = start[:, None] + params.gain * jnp.arange(1, 7)
     alive = jnp.concatenate([jnp.ones((5, 1)), positions[:, :-1] <= Walk.limit], axis=1)
     expected = (positions * jnp.cumprod(alive, axis=1)).sum(axis=1)
     np.testing.assert_allclose(returns, expected, rtol=1e-5)
-    assert alive.min() == 0  # the episodes did end early
+    np.testing.assert_array_equal(alive.sum(axis=1), 2)  # of 6 steps, a new episode after them
 
 
 @pytest.fixture(scope="module")
