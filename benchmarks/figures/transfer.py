@@ -82,8 +82,8 @@ def returns(summary: dict[str, Any]) -> list[str]:
     controls = {name: control["scaled"] for name, control in summary["controls"].items()}
     bars = {
         "source\npolicy": ([0.0], PALE),
-        "more source\ntraining": (controls["more_source_training"]["per_seed"], PALE),
-        "action noise\nonly": (controls["action_noise"]["per_seed"], PALE),
+        "more\ntraining": (controls["more_source_training"]["per_seed"], PALE),
+        "action\nnoise": (controls["action_noise"]["per_seed"], PALE),
         "GARAT": (summary["scaled"]["per_seed"], COLOURS[0]),
         "trained in\nthe target": ([1.0], PALE),
     }

@@ -1,0 +1,189 @@
+"""Write the tables of README.md and docs/ from the result files.
+
+`python benchmarks/figures/tables.py` replaces what stands between `<!-- table NAME -->` and
+`<!-- end -->`; with `--check` it only says whether anything would change.
+"""
+
+import dataclasses
+import json
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+BLOCK = re.compile(r"(<!-- table (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Write the tables of README.md and docs/ from the result files."""
+
+    check: bool = False
+    """Change nothing; exit with 1 if a table is not what its result file gives."""
+
+
+def read(name: str) -> dict[str, Any]:
+    return json.loads((ROOT / "benchmarks/results" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    marks = ["---", *["---:"] * (len(columns) - 1)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in (columns, marks, *rows))
+
+
+def origin(name: str, result: dict[str, Any]) -> str:
+    """Say where a table comes from."""
+    machine = result["machine"]
+    return (
+        f"\n`{result['command']}` → `benchmarks/results/{name}.json` "
+        f"(commit {result['git']['commit'][:7]}, {machine['cores']} cores of an {machine['cpu']})\n"
+    )
+
+
+def spread(scaled: dict[str, Any]) -> str:
+    if scaled["mean"] is None:
+        return "not meaningful"
+    return f"{scaled['mean']:.2f} ± {scaled['standard_error']:.2f}"
+
+
+def transfer() -> str:
+    name = "transfer_inverted_pendulum_heavy"
+    result = read(name)
+    row = result["rows"][0]
+    controls, returns = row["controls"], row["returns"]
+
+    def mean(values: Sequence[float]) -> str:
+        return f"{np.mean(values):.0f}"
+
+    rows = [
+        ("source policy", "0", mean(returns["source_policy"])),
+        (
+            "control: as much more training in the source",
+            spread(controls["more_source_training"]["scaled"]),
+            mean(controls["more_source_training"]["returns"]),
+        ),
+        (
+            "control: as much training with action noise",
+            spread(controls["action_noise"]["scaled"]),
+            mean(controls["action_noise"]["returns"]),
+        ),
+        ("**GARAT**", f"**{spread(row['scaled'])}**", mean(returns["method"])),
+        ("policy trained in the target", "1", mean(returns["target_policy"])),
+    ]
+    columns = ("trained in", "scaled return in the target", "return (of 1000)")
+    ratio, zero = row["error_ratio"], row["baselines"]["zero_action"]["ratio"]
+    counted = sum(row["meaningful"])
+    text = (
+        f"\nMean ± standard error over {counted} meaningful of {len(row['seeds'])} seeds, 50 "
+        f"episodes each, {row['target_transitions']} target transitions. Error of one step, as a "
+        f"share of the source's: **{np.mean(ratio):.3f}** (worst seed {max(ratio):.3f}); with "
+        f"every action replaced by zero {np.mean(zero):.2f}.\n"
+    )
+    return table(columns, rows) + text + origin(name, result)
+
+
+def variants() -> str:
+    result = read("grounding_variants")
+    rows = [
+        (
+            row["variant"],
+            "diverged" if row["mean"] is None else f"{row['mean']:.3f}",
+            "" if row["worst"] is None else f"{row['worst']:.3f}",
+        )
+        for row in result["rows"]
+    ]
+    columns = ("variant", "error ratio after 50 updates, mean", "worst seed")
+    return table(columns, rows) + origin("grounding_variants", result)
+
+
+def throughput() -> str:
+    result = read("throughput")
+    rows = [
+        (
+            row["agent"],
+            {"mujoco": "C MuJoCo", "mjx": "MJX"}[row["engine"]],
+            str(row["seeds"]),
+            f"{row['steps_per_second']:,.0f}",
+            f"{row['steps_per_processor_second']:,.0f}",
+            f"{row['share_of_random_actions']:.2f}",
+            f"{row['compile_processor_seconds']:.1f}",
+        )
+        for row in result["rows"]
+    ]
+    columns = ("", "engine", "seeds", "steps/s", "a processor second", "share", "compilation [s]")
+    return table(columns, rows) + origin("throughput", result)
+
+
+def flags() -> str:
+    result = read("xla_flags")
+    emitters = {True: "on (XLA's default)", False: "off", None: "–"}
+    rows = [
+        (
+            row["model"].replace("_", " "),
+            {"mujoco": "C MuJoCo", "mjx": "MJX"}[row["engine"]],
+            emitters[row["fusion_emitters"]],
+            f"{row['steps_per_second']:,.0f}",
+            f"{row['compile_processor_seconds']:.1f}",
+        )
+        for row in result["rows"]
+    ]
+    columns = ("model", "engine", "fusion emitters", "steps/s", "compilation, processor seconds")
+    return table(columns, rows) + origin("xla_flags", result)
+
+
+def real_data() -> str:
+    result = read("real_data")
+
+    def named(row: dict[str, Any]) -> str:
+        return ", ".join(f"{c['effect']} at {c['target']}" for c in row["selected"]) or "–"
+
+    rows = [
+        (
+            row["case"].replace("_", " "),
+            row["verdict"].replace("_", " "),
+            named(row),
+            f"{row['error']['before']:.3g} → {row['error']['after']:.3g}",
+            f"{row['error']['noise_floor']:.3g}",
+            f"{row['error']['unexplained_share']:.2f}",
+        )
+        for row in result["rows"]
+    ]
+    columns = ("recordings", "verdict", "missing", "held-out error", "noise floor", "unexplained")
+    return table(columns, rows) + origin("real_data", result)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "transfer": transfer,
+    "variants": variants,
+    "throughput": throughput,
+    "flags": flags,
+    "real_data": real_data,
+}
+
+
+def filled(text: str) -> str:
+    """Return a document with its tables as the result files give them."""
+    return BLOCK.sub(lambda block: block[1] + TABLES[block[2]]() + block[3], text)
+
+
+def main() -> None:
+    check = tyro.cli(Arguments).check
+    stale = []
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        text = path.read_text(encoding="utf-8")
+        if filled(text) != text:
+            stale.append(path.relative_to(ROOT).as_posix())
+            if not check:
+                path.write_text(filled(text), encoding="utf-8")
+    if stale:
+        print(("stale: " if check else "written: ") + ", ".join(stale))
+    sys.exit(1 if stale and check else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""The documents: numbers are the result files', links lead somewhere, snippets run."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+DOCUMENTS = [*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("*.md")]
+SNIPPETS = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
+
+
+def test_tables_are_what_the_result_files_give():
+    program = REPOSITORY / "benchmarks" / "figures" / "tables.py"
+    done = subprocess.run(
+        [sys.executable, str(program), "--check"], cwd=REPOSITORY, capture_output=True, text=True
+    )
+    assert done.returncode == 0, f"{done.stdout}; run python benchmarks/figures/tables.py"
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_relative_links_lead_somewhere(path):
+    text = path.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" not in target:
+            name = target.partition("#")[0]
+            assert not name or (path.parent / name).exists(), f"{path.name}: {target}"
+
+
+@pytest.mark.parametrize("number", range(len(SNIPPETS)))
+def test_the_readmes_snippets_compile(number):
+    compile(SNIPPETS[number], f"README snippet {number}", "exec")
+
+
+def test_the_readmes_world_runs(capsys):
+    (snippet,) = (text for text in SNIPPETS if "make_world(" in text)
+    exec(snippet, {})
+    assert "(64, 4)" in capsys.readouterr().out
