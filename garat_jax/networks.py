@@ -17,8 +17,9 @@ def forward(network: nn.Module, weights: Any, inputs: jax.Array) -> Any:
 class MLP(nn.Module):
     """Tanh layers and a linear output, with weights of variance 1 / inputs.
 
-    Orthogonal weights, which many use, need LAPACK's QR; two batched calls of it at once block each
-    other for ever on a CPU with two threads (jaxlib 0.10.2), which `vmap` over seeds does.
+    Orthogonal weights, which many use, need LAPACK's QR. Under `vmap` over seeds several batched
+    calls of it run at once, and on a CPU with two threads they have been seen to wait for each
+    other for ever (jaxlib 0.10.2).
 
     Attributes:
         hidden: Widths of the hidden layers.
