@@ -92,6 +92,7 @@ class Transfer:
             raise UserError(f"--seeds {self.seeds}: expected 1 or more")
         from garat_jax.envs.pairs import PAIRS
         from garat_jax.presets import METHODS
+        from garat_jax.summary import describe
         from garat_jax.transfer import run_transfer
 
         config = choose("method", self.method, METHODS)(
@@ -99,7 +100,7 @@ class Transfer:
         )
         out = self.out or Path("runs") / f"{self.pair}-{self.method}"
         with make_run(self, out, seeds=range(self.seeds), resume=self.resume) as run:
-            run_transfer(config, run)
+            say(describe(run_transfer(config, run)))
         say(f"report: {run.root / 'report.html'}")
 
 

@@ -11,6 +11,7 @@ from garat_jax import report, summary
 from garat_jax.diagnosis import run_diagnose
 from garat_jax.diagnosis.convert import free_pendulum
 from garat_jax.diagnosis.hidden import Hidden, make_recordings
+from garat_jax.diagnosis.report import diagnosis_lead
 from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.envs.pairs import PAIRS
 from garat_jax.presets import garat
@@ -39,6 +40,7 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
     config = dataclasses.replace(garat(PAIRS[PAIR]), first_seed=seed)
     seeds = range(seed, seed + config.seeds)
     transfer = run_transfer(config, _part(run, "transfer", {"pair": PAIR}, seeds))
+    Console(highlight=False, markup=False, soft_wrap=True).print(summary.describe(transfer))
 
     console.rule("2. A hidden effect: which physics does the model lack?")
     hidden = make_recordings(PENDULUM, run.path("measurements"), seed)
@@ -56,7 +58,7 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
     report.write(
         run.path("report.html"),
         title="What garat does with a simulator that is wrong",
-        lead=f"{summary.lead(transfer)} {found.sentence}",
+        lead=f"{summary.lead(transfer)} {diagnosis_lead(found)}",
         facts=_facts(transfer, found),
         sections=sections,
         reproduce=report.Reproduce.from_config(run.read_json("config.json")),
@@ -81,7 +83,7 @@ def _truth(found: Diagnosis, hidden: Hidden) -> Section:
     named = [(c.effect, c.target) for c in found.selected]
     verdict = "found it" if named == [(hidden.kind, hidden.target)] else "did not find just that"
     return Section(
-        "what was hidden",
+        "What was hidden",
         f"The recordings came from C MuJoCo at a 32 times finer timestep, with sensor noise and "
         f"{hidden.kind} at {hidden.target} ({sizes}). The diagnosis, which saw the recordings "
         f"alone, {verdict}.",

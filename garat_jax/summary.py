@@ -133,6 +133,23 @@ def lead(summary: Mapping[str, Any]) -> str:
     )
 
 
+def describe(summary: Mapping[str, Any]) -> str:
+    """Return the result in a few lines for a terminal."""
+    controls = summary["controls"]
+    baseline = np.mean(summary["baselines"]["zero_action"]["ratio"])
+    lines = [
+        lead(summary),
+        "Scaled return in the target (0: source policy, 1: policy trained there), mean ± standard "
+        "error:",
+        f"  {summary['method']:<22}{_with_error(summary['scaled'])}",
+        f"  {'more source training':<22}{_with_error(controls['more_source_training']['scaled'])}",
+        f"  {'action noise only':<22}{_with_error(controls['action_noise']['scaled'])}",
+        f"Error of one step, share of the source's: {np.mean(summary['error_ratio']):.3f}; "
+        f"with zero action {baseline:.3f}.",
+    ]
+    return "\n".join(lines)
+
+
 def facts(summary: Mapping[str, Any]) -> list[Fact]:
     """Return the numbers to be seen first."""
     scaled = {"method": summary["scaled"]} | {
