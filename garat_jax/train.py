@@ -15,6 +15,7 @@ from rich.console import Console
 from garat_jax import checkpoint
 from garat_jax.dynamics import Dynamics
 from garat_jax.errors import DivergedError
+from garat_jax.interrupt import deferred_interrupt
 from garat_jax.runs import RunDirectory
 
 State = TypeVar("State")
@@ -100,7 +101,8 @@ class Trainer:
         """Compile a function, call it once, and return its result when it is there."""
         compiled = self._compile(function, arguments, options)
         started = time.monotonic()
-        result = jax.block_until_ready(compiled(*arguments))
+        with deferred_interrupt():
+            result = jax.block_until_ready(compiled(*arguments))
         self.seconds.run += time.monotonic() - started
         return result
 
@@ -115,23 +117,24 @@ class Trainer:
         saved = reported = time.monotonic()
         progress = (first, state)  # one name, so that an interrupt never parts the two
         try:
-            while progress[0] < num_iterations:
-                iteration, last = progress[0] + 1, progress[1]
-                new, metrics, finite = step(last, params)
-                metrics = {name: np.asarray(value) for name, value in metrics.items()}
-                if not np.asarray(finite).all():
-                    self._diverged(stage, iteration, last, new, np.asarray(finite))
-                self.run.log(iteration, stage=stage, **metrics)
-                progress = (iteration, new)
-                now = time.monotonic()
-                if now - reported > REPORT_SECONDS:
-                    reported = now
-                    self._report(stage, iteration, num_iterations, metrics)
-                if now - saved > CHECKPOINT_SECONDS:
-                    saved = now
-                    self._save(folder, *progress)
-                if "finished" in metrics and metrics["finished"].all():
-                    break
+            with deferred_interrupt() as interrupted:
+                while progress[0] < num_iterations and not interrupted():
+                    iteration, last = progress[0] + 1, progress[1]
+                    new, metrics, finite = step(last, params)
+                    metrics = {name: np.asarray(value) for name, value in metrics.items()}
+                    if not np.asarray(finite).all():
+                        self._diverged(stage, iteration, last, new, np.asarray(finite))
+                    self.run.log(iteration, stage=stage, **metrics)
+                    progress = (iteration, new)
+                    now = time.monotonic()
+                    if now - reported > REPORT_SECONDS:
+                        reported = now
+                        self._report(stage, iteration, num_iterations, metrics)
+                    if now - saved > CHECKPOINT_SECONDS:
+                        saved = now
+                        self._save(folder, *progress)
+                    if "finished" in metrics and metrics["finished"].all():
+                        break
         except KeyboardInterrupt:
             self._save(folder, *progress)
             raise
