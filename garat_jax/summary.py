@@ -23,6 +23,7 @@ def summarise(
     method: str,
     seeds: Sequence[int],
     solved_return: float,
+    source_solved: np.ndarray,
     returns: Mapping[str, np.ndarray],
     errors: Mapping[str, np.ndarray],
     curve: Sequence[Mapping[str, Any]],
@@ -37,6 +38,7 @@ def summarise(
         method: The method's name.
         seeds: The seeds.
         solved_return: Return from which the task counts as solved.
+        source_solved: Whether the source policy solved the source, [seeds].
         returns: Mean target returns [seeds] of `source_policy`, `target_policy`, `method` and the
             controls.
         errors: Held-out transition errors [seeds] of `source`, `grounded` and the baselines.
@@ -47,7 +49,7 @@ def summarise(
     """
     source, target = returns["source_policy"], returns["target_policy"]
     solved = TARGET_FRACTION * solved_return
-    meaningful = (source < SOURCE_FRACTION * target) & (target >= solved)
+    meaningful = source_solved & (source < SOURCE_FRACTION * target) & (target >= solved)
     scaled = {
         name: scale(returns[name], source, target, meaningful) for name in ("method", *CONTROLS)
     }
@@ -57,6 +59,7 @@ def summarise(
         "method": method,
         "seeds": seeds,
         "returns": {name: returns[name] for name in ("source_policy", "target_policy", "method")},
+        "source_solved": source_solved,
         "meaningful": meaningful,
         "scaled": scaled["method"],
         "controls": {name: {"returns": returns[name], "scaled": scaled[name]} for name in CONTROLS},
@@ -123,8 +126,9 @@ def lead(summary: Mapping[str, Any]) -> str:
     ratio = np.mean(summary["error_ratio"])
     if mean is None:
         return (
-            "No seed is meaningful: either the source policy already works in the target, or no "
-            "policy solved it. Nothing can be said about the method from this run."
+            "No seed is meaningful: the source policy did not solve the source or already works in "
+            "the target, or no policy solved the target. Nothing can be "
+            "said about the method from this run."
         )
     return (
         f"After grounding, the policy reaches {mean:.2f} of the way from the source policy (0) to "
@@ -243,7 +247,7 @@ def _returns_caption(summary: Mapping[str, Any]) -> str:
     ]
     note = (
         f" Seeds {', '.join(left_out)} are not meaningful and are left out: their source policy "
-        "already works in the target, or their target policy does not."
+        "does not solve the source or already works in the target, or their target policy fails."
         if left_out
         else ""
     )

@@ -86,10 +86,11 @@ class Trainer:
         first = 0
         if self.run.resumed and (latest := checkpoint.latest_step(folder)) is not None:
             state, first = checkpoint.restore(folder, state), latest
-            self.run.rewind(first, stage)
             self.console.print(f"{stage}: restored after iteration {first}", highlight=False)
         if (self.run.root / _done(stage)).exists():
             return state
+        if self.run.resumed:
+            self.run.rewind(first, stage)
         compiled = self._compile(_with_finite(step), (state, params), options)
         started = time.monotonic()
         try:
@@ -144,7 +145,8 @@ class Trainer:
         return progress[1]
 
     def _save(self, folder, iteration: int, state) -> None:
-        if iteration > (checkpoint.latest_step(folder) or 0):
+        latest = checkpoint.latest_step(folder)
+        if latest is None or iteration > latest:
             checkpoint.save(folder, iteration, state)
 
     def _report(self, stage: str, iteration: int, of: int, metrics) -> None:

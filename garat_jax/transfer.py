@@ -92,8 +92,8 @@ class Experiment:
     worlds: Worlds
     keys: jax.Array
 
-    def solve(self, stage: str, world: World) -> ActorCriticState:
-        """Train policies [seeds] from scratch until each solves a world."""
+    def solve(self, stage: str, world: World) -> UntilSolved:
+        """Train policies [seeds] from scratch until each solves a world, and say which did."""
         config, agent = self.config, self.worlds.agent
 
         def evaluate(state: ActorCriticState, params: Params, key: jax.Array) -> jax.Array:
@@ -106,7 +106,7 @@ class Experiment:
             return UntilSolved(agent.init(init_key, world.params), jnp.zeros((), bool), key)
 
         step = train.until_solved(agent.step, evaluate, config.pair.task.solved_return)
-        carry = self.train(
+        return self.train(
             stage,
             step,
             self.map(start, _fold(self.keys, stage)),
@@ -114,7 +114,6 @@ class Experiment:
             config.max_iterations,
             world,
         )
-        return carry.state
 
     def retrain(self, stage: str, env: Env, params: Params, start: ActorCriticState, axes=None):
         """Train policies [seeds] further in an environment; `axes` as `vmap`'s for `params`."""
@@ -222,8 +221,8 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
     keys = jax.vmap(jax.random.key)(jnp.asarray(trainer.seeds))
     experiment = Experiment(config, trainer, Worlds(source, target, agent), keys)
 
-    source_state = experiment.solve("source policy", source)
-    target_state = experiment.solve("target policy", target)
+    source_state, source_solved, _ = experiment.solve("source policy", source)
+    target_state = experiment.solve("target policy", target).state
     recorded = experiment.record(source_state.policy, "target transitions")
     held_out = experiment.record(source_state.policy, "held-out transitions")
     garat, grounding = experiment.ground(source_state.policy, recorded, held_out)
@@ -254,6 +253,7 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
         method=config.method,
         seeds=list(trainer.seeds),
         solved_return=task.solved_return,
+        source_solved=np.asarray(source_solved),
         returns=returns,
         errors=errors,
         curve=[line for line in run.metrics() if line["stage"] == "grounding"],

@@ -37,6 +37,7 @@ def summarise(source=(100.0, 100.0, 100.0), target=(1000.0, 1000.0, 1000.0), cou
         "method": "garat",
         "seeds": seeds,
         "solved_return": 950.0,
+        "source_solved": np.ones(count, bool),
         "returns": returns,
         "errors": errors,
         "curve": curve,
@@ -127,3 +128,9 @@ def test_when_no_seed_is_meaningful_there_is_no_mean_and_the_report_says_so(run)
 
 def test_a_grounding_without_updates_can_be_reported(run):
     assert "some_pair" in written(run, summarise(curve=[]))
+
+
+def test_a_seed_whose_source_policy_solved_nothing_is_not_meaningful():
+    result = summarise(source_solved=np.asarray([True, False, True]))
+    assert result["meaningful"] == [True, False, True]
+    assert result["scaled"]["per_seed"][1] is None

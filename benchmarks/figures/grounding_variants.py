@@ -133,7 +133,7 @@ def run_variants(arguments: Arguments, folder: Path) -> list[dict[str, Any]]:
     pair = choose("pair", arguments.pair, PAIRS)
     config = dataclasses.replace(garat(pair, seeds=arguments.seeds), num_updates=arguments.updates)
     experiment = make_experiment(config, folder / "shared")
-    policy = experiment.solve("source policy", experiment.worlds.source).policy
+    policy = experiment.solve("source policy", experiment.worlds.source).state.policy
     held_out = experiment.record(policy, "held-out transitions")
     recorded = experiment.record(policy, "target transitions")
     rows = baselines(experiment, recorded, held_out)
