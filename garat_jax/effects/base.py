@@ -186,6 +186,33 @@ class Effect(abc.ABC):
             if not self.fits(host, element, name):
                 raise UserError(f"{self.kind} cannot act on {self.target!r}: not a one-dof joint")
 
+    @classmethod
+    def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
+        """Return the sizes at which the effect is tried before it is fitted.
+
+        One size of the first parameter does for laws that grow smoothly from "no effect". A law
+        with a threshold shows only beyond it and is tried at several.
+
+        Args:
+            host: The compiled model: ranges of commands and forces.
+            target: Where the effect would act.
+        """
+        del host, target
+        first = cls.parameters()[0]
+        return ({first.name: first.nominal + first.scale},)
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Write the effect into a spec as plain MJCF, as far as MJCF can say it.
+
+        Args:
+            spec: The model, without this effect's `prepare`.
+
+        Returns:
+            What MJCF cannot say of it, in one line; empty if it says everything.
+        """
+        del spec
+        return f"MJCF has no words for {self.kind} at {self.target}"
+
     def prepare(self, spec: mujoco.MjSpec) -> None:  # noqa: B027
         """Change the model's structure, before it is compiled, so that the law can act."""
 
