@@ -1,0 +1,54 @@
+"""The pairs differ in what the paper's table says, and in nothing else."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from garat_jax import dynamics
+from garat_jax.envs.pairs import PAIRS
+
+# Desai et al. 2020, table of modified environments.
+MASSES = [
+    ("inverted_pendulum_heavy", ["pole"], 4.89, 100.0),
+    ("hopper_heavy", ["torso"], 3.53, 6.0),
+    ("half_cheetah_heavy", None, 14.0, 20.0),
+    ("walker_heavy", ["torso"], 3.534, 10.0),
+]
+
+
+def compiled(name: str) -> list[mujoco.MjModel]:
+    pair = PAIRS[name]
+    spec = dynamics.load_spec(pair.task.mjcf)
+    worlds = (dynamics.compile(spec, o, engine="mujoco") for o in (pair.source, pair.target))
+    return [world.host.model for world in worlds]
+
+
+@pytest.mark.parametrize(("name", "bodies", "light", "heavy"), MASSES, ids=lambda x: str(x))
+def test_masses_are_the_papers_and_inertia_scales_with_them(name, bodies, light, heavy):
+    source, target = compiled(name)
+    names = bodies or [source.body(i).name for i in range(1, source.nbody)]
+    for model, expected in ((source, light), (target, heavy)):
+        mass = sum(model.body(body).mass[0] for body in names)
+        assert mass == pytest.approx(expected, rel=1e-6)
+    for i in range(1, source.nbody):
+        ratio = heavy / light if source.body(i).name in names else 1.0
+        np.testing.assert_allclose(target.body_mass[i], ratio * source.body_mass[i], rtol=1e-6)
+        np.testing.assert_allclose(
+            target.body_inertia[i], ratio * source.body_inertia[i], rtol=1e-6
+        )
+
+
+def test_a_cheetah_of_14_kg_is_the_tasks():
+    source, _ = compiled("half_cheetah_heavy")
+    model = dynamics.load_spec(PAIRS["half_cheetah_heavy"].task.mjcf).compile()
+    np.testing.assert_allclose(source.body_mass, model.body_mass, rtol=1e-6)
+    np.testing.assert_allclose(source.body_inertia, model.body_inertia, rtol=1e-6)
+
+
+def test_only_the_foots_sliding_friction_differs():
+    source, target = compiled("hopper_high_friction")
+    foot = source.geom("foot").id
+    assert (source.geom_friction[foot, 0], target.geom_friction[foot, 0]) == (2.0, 2.2)
+    target.geom_friction[foot, 0] = 2.0
+    np.testing.assert_array_equal(source.geom_friction, target.geom_friction)
+    np.testing.assert_array_equal(source.body_mass, target.body_mass)
