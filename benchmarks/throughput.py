@@ -78,7 +78,7 @@ def random_agent(env: Env, num_envs: int, num_steps: int) -> Agent:
     def step(state, env_params):
         env_state, key = state
         key, unroll_key = jax.random.split(key)
-        env_state, transitions = rollout.unroll(
+        env_state, transitions, _ = rollout.unroll(
             env, env_params, policy, (), env_state, unroll_key, num_steps
         )
         return (env_state, key), {"reward": transitions.reward.mean()}, transitions

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
+from garat_jax.errors import UserError
+
 State = TypeVar("State")
 
 
@@ -51,7 +53,8 @@ def restore(directory: str | Path, like: State, step: int | None = None) -> Stat
         step: The step to read; the newest if None.
 
     Raises:
-        ValueError: There is no such checkpoint, or it is of a state of another structure.
+        ValueError: There is no such checkpoint.
+        UserError: It is of a state of another structure.
     """
     newest = latest_step(directory)
     if newest is None:
@@ -122,7 +125,7 @@ def _check_structure(metadata: Any, expected: dict[str, np.ndarray], directory: 
     wanted = {name: (array.shape, array.dtype) for name, array in expected.items()}
     for name in sorted(stored.keys() | wanted.keys()):
         if stored.get(name) != wanted.get(name):
-            raise ValueError(
+            raise UserError(
                 f"the checkpoint in {directory} does not fit this program: {name} is "
                 f"{stored.get(name)} there and {wanted.get(name)} here (shape and dtype); "
                 "restore it with the version and settings that wrote it"

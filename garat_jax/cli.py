@@ -18,7 +18,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from garat_jax import __version__
-from garat_jax.commandline import PROGRAM, how_to_go_on, is_users_mistake, parse
+from garat_jax.commandline import PROGRAM, how_to_go_on, parse
 from garat_jax.errors import DivergedError, UserError, choose
 
 if TYPE_CHECKING:
@@ -52,6 +52,8 @@ class Demo:
     """Recordings of a free pendulum to diagnose as well."""
     force: bool = False
     """Replace an earlier run in DIR."""
+    resume: bool = False
+    """Go on from the last checkpoint in DIR."""
 
     def run(self) -> None:
         """Run the tour."""
@@ -59,7 +61,7 @@ class Demo:
             raise UserError(f"--measurements: there is no folder {self.measurements}")
         from garat_jax.demo import run_demo
 
-        with make_run(self, self.out, seeds=[self.seed]) as run:
+        with make_run(self, self.out, seeds=[self.seed], resume=self.resume) as run:
             run_demo(run, seed=self.seed, measurements=self.measurements)
         say(f"report: {run.root / 'report.html'}")
 
@@ -229,9 +231,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return complain(f"interrupted; {how_to_go_on(arguments, COMMANDS)}", INTERRUPTED)
     except DivergedError as error:
         return complain(f"error: {error}", FAILED)
-    except ValueError as error:
-        if not is_users_mistake(error):
-            raise
+    except UserError as error:
         return complain(f"error: {error}", USER_ERROR)
     return DONE
 
@@ -271,6 +271,8 @@ def make_run(
     }
     line = shlex.join([PROGRAM, *sys.argv[1:]])
     run = RunDirectory.create(out, config, line, seeds, force=command.force, resume=resume)
+    if run.resumed and (changed := run.changed_versions()):
+        complain(f"warning: the run was begun with other versions: {', '.join(changed)}", DONE)
     try:
         yield run
     except UserError:

@@ -5,7 +5,6 @@ import dataclasses
 import io
 import re
 import shlex
-import traceback
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -46,18 +45,6 @@ def parse(arguments: Sequence[str], commands: Mapping[str, type], description: s
             return None
     _check_spelling(arguments, commands)
     raise UserError(_one_line(complaint.getvalue()))
-
-
-def is_users_mistake(error: ValueError) -> bool:
-    """Tell a message that is meant for the user from a fault of the program.
-
-    Our own code raises ValueError with what was expected and how to mend it. One that comes out of
-    a library below says nothing to the user and has to keep its traceback.
-    """
-    if isinstance(error, UserError):
-        return True
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return bool(frames) and frames[-1].f_globals.get("__name__", "").startswith("garat_jax.")
 
 
 def how_to_go_on(arguments: Sequence[str], commands: Mapping[str, type]) -> str:

@@ -24,7 +24,7 @@ PENDULUM = Path(__file__).parent / "envs" / "assets" / "pendulum.xml"
 
 
 def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
-    """Take the tour.
+    """Take the tour; a resumed one goes on within the transfer and diagnoses anew.
 
     Args:
         run: Where the results go: `transfer/`, `diagnosis/`, `real/` and `report.html`.
@@ -39,12 +39,13 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
     console.rule("1. Transfer: ground the source in the target's data")
     config = dataclasses.replace(garat(PAIRS[PAIR]), first_seed=seed)
     seeds = range(seed, seed + config.seeds)
-    transfer = run_transfer(config, _part(run, "transfer", {"pair": PAIR}, seeds))
+    part = _part(run, "transfer", {"pair": PAIR}, seeds, resume=run.resumed)
+    transfer = run_transfer(config, part)
     Console(highlight=False, markup=False, soft_wrap=True).print(summary.describe(transfer))
 
     console.rule("2. A hidden effect: which physics does the model lack?")
     hidden = make_recordings(PENDULUM, run.path("measurements"), seed)
-    part = _part(run, "diagnosis", {"model": PENDULUM}, [seed])
+    part = _part(run, "diagnosis", {"model": PENDULUM}, [seed], force=run.resumed)
     found, pages = run_diagnose(PENDULUM, hidden.fit, hidden.holdout, part)
     sections = [
         *_titled("Transfer", summary.sections(transfer, PAIRS[PAIR].summary)),
@@ -52,7 +53,7 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
     ]
     if real is not None:
         console.rule("3. Real measurements: a pendulum that swings freely")
-        part = _part(run, "real", {"model": real.model}, [])
+        part = _part(run, "real", {"model": real.model}, [], force=run.resumed)
         pages = run_diagnose(real.model, real.fit, real.holdout, part).sections
         sections += _titled("Real pendulum", pages)
     report.write(
@@ -67,10 +68,11 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
 
 
 def _part(
-    run: RunDirectory, name: str, config: Mapping[str, Any], seeds: Sequence[int]
+    run: RunDirectory, name: str, config: Mapping[str, Any], seeds: Sequence[int], **again: bool
 ) -> RunDirectory:
+    """Make the folder of one stop, whose `again` says what becomes of an earlier one."""
     command = run.read_json("config.json")["command"]
-    return RunDirectory.create(run.root / name, config, command, seeds)
+    return RunDirectory.create(run.root / name, config, command, seeds, **again)
 
 
 def _titled(title: str, sections: Sequence[Section]) -> list[Section]:

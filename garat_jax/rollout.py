@@ -1,4 +1,9 @@
-"""The only callers of `Env.step`: batches of experience, evaluation, recorded transitions."""
+"""The only callers of `Env.step`: batches of experience, evaluation, recorded transitions.
+
+A world whose physics leaves the finite numbers ends its episode: the step counts as terminated,
+with no reward and nothing seen after it. It is counted, and the first such step of a batch is
+kept as it was, so that nothing is hidden.
+"""
 
 from typing import NamedTuple
 
@@ -7,6 +12,25 @@ import jax.numpy as jnp
 
 from garat_jax.env import Env, EnvState
 from garat_jax.types import Params, Policy, Transition
+
+LARGEST = 1e10
+"""Absolute value beyond which a state has exploded; MuJoCo's own limit, mjMAXVAL."""
+
+
+class Fault(NamedTuple):
+    """Where worlds left the finite numbers in a batch of experience.
+
+    Attributes:
+        num_steps: Steps in which one did, [].
+        before: The environment in which the first of them began; zeros if there was none.
+        action: The action taken in it, [action_size].
+        after: The environment that came of it.
+    """
+
+    num_steps: jax.Array
+    before: EnvState
+    action: jax.Array
+    after: EnvState
 
 
 class Recorded(NamedTuple):
@@ -21,28 +45,53 @@ def reset(env: Env, params: Params, key: jax.Array, num_envs: int) -> EnvState:
     return jax.vmap(env.reset, (None, 0))(params, jax.random.split(key, num_envs))
 
 
+def no_fault(env: Env, state: EnvState) -> Fault:
+    """Return the record of a batch in which nothing has gone wrong yet; `state` is [B]."""
+    nothing = jax.tree.map(lambda x: jnp.zeros_like(x[0]), state)
+    return Fault(jnp.zeros((), jnp.int32), nothing, jnp.zeros(env.action_size), nothing)
+
+
 def _step(env: Env, params: Params, policy: Policy, policy_params: Params, state, key):
-    """Step a batch [B] and reset what has ended."""
+    """Step a batch [B] and reset what has ended; return the true next states and faults too."""
     num_envs = state.steps.shape[0]
     act_keys, step_keys, reset_keys = jax.random.split(key, (3, num_envs))
     action, log_prob = jax.vmap(policy, (None, 0, 0))(policy_params, state.obs, act_keys)
     result = jax.vmap(env.step, (None, 0, 0, 0))(params, state, action, step_keys)
+    faulty = ~jax.vmap(_is_sound)((result.state, result.reward))
+    terminated = result.terminated | faulty
+    truncated = result.truncated & ~faulty
     transition = Transition(
         obs=state.obs,
         action=action,
-        reward=result.reward,
-        next_obs=result.state.obs,
-        terminated=result.terminated,
-        truncated=result.truncated,
+        reward=jnp.where(faulty, 0.0, result.reward),
+        next_obs=jnp.where(faulty[:, None], state.obs, result.state.obs),
+        terminated=terminated,
+        truncated=truncated,
         log_prob=log_prob,
     )
     fresh = jax.vmap(env.reset, (None, 0))(params, reset_keys)
-    done = result.terminated | result.truncated
+    done = terminated | truncated
 
     def select(new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(done.reshape(done.shape + (1,) * (new.ndim - 1)), new, old)
 
-    return jax.tree.map(select, fresh, result.state), transition
+    return jax.tree.map(select, fresh, result.state), transition, (faulty, action, result.state)
+
+
+def _is_sound(values) -> jax.Array:
+    """Say whether every float is finite and within MuJoCo's limit, []."""
+    floats = [x for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.stack([jnp.all(jnp.abs(x) < LARGEST) for x in floats]).all()
+
+
+def _note(fault: Fault, before: EnvState, outcome) -> Fault:
+    """Count the faulty steps of a batch [B] and keep the first of all."""
+    faulty, action, after = outcome
+    worst = jnp.argmax(faulty)
+    found = jax.tree.map(lambda x: x[worst], (before, action, after))
+    is_first = (fault.num_steps == 0) & faulty[worst]
+    kept = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), found, tuple(fault[1:]))
+    return Fault(fault.num_steps + faulty.sum(), *kept)
 
 
 def unroll(
@@ -53,7 +102,7 @@ def unroll(
     state: EnvState,
     key: jax.Array,
     length: int,
-) -> tuple[EnvState, Transition]:
+) -> tuple[EnvState, Transition, Fault]:
     """Let a policy act in a batch of environments.
 
     Args:
@@ -66,13 +115,17 @@ def unroll(
         length: Control steps T.
 
     Returns:
-        Where the environments stand now, [B], and the transitions, [T, B].
+        Where the environments stand now, [B], the transitions, [T, B], and what went wrong.
     """
 
-    def step(state, key):
-        return _step(env, params, policy, policy_params, state, key)
+    def step(carry, key):
+        state, fault = carry
+        after, transition, outcome = _step(env, params, policy, policy_params, state, key)
+        return (after, _note(fault, state, outcome)), transition
 
-    return jax.lax.scan(step, state, jax.random.split(key, length))
+    carry = (state, no_fault(env, state))
+    (state, fault), transitions = jax.lax.scan(step, carry, jax.random.split(key, length))
+    return state, transitions, fault
 
 
 def record(
@@ -87,7 +140,7 @@ def record(
     """Collect transitions from fresh episodes, with the states they began in, [T, B]."""
 
     def step(state, key):
-        after, transition = _step(env, params, policy, policy_params, state, key)
+        after, transition, _ = _step(env, params, policy, policy_params, state, key)
         return after, Recorded(transition, state)
 
     reset_key, key = jax.random.split(key)
@@ -107,7 +160,7 @@ def evaluate(
 
     def step(carry, key):
         state, alive, total = carry
-        state, transition = _step(env, params, policy, policy_params, state, key)
+        state, transition, _ = _step(env, params, policy, policy_params, state, key)
         total = total + alive * transition.reward
         alive = alive & ~(transition.terminated | transition.truncated)
         return (state, alive, total), None

@@ -1,7 +1,8 @@
 """Run directories: what was run, with which versions and seeds, and what came out. No JAX.
 
-A run directory holds `config.json` (format "garat-run/1"), `metrics.jsonl` (one line a logged
-step), and whatever the command adds to it: summaries, checkpoints, plots, `report.html`.
+A run directory holds `config.json` (format "garat-run/1": the command's arguments as `config`, the
+settings that they stand for as `settings`, seeds, versions, machine), `metrics.jsonl` (one line a
+logged step), and whatever the command adds to it: summaries, checkpoints, plots, `report.html`.
 """
 
 import dataclasses
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from garat_jax.errors import UserError
-from garat_jax.provenance import provenance
+from garat_jax.provenance import provenance, versions
 
 FORMAT = "garat-run/1"
 CONFIG = "config.json"
@@ -98,6 +99,30 @@ class RunDirectory:
         if not is_run(root):
             raise UserError(f"{root} holds no run: {CONFIG} of format {FORMAT!r} is not there")
         return cls(root, resumed=True)
+
+    def record_settings(self, settings: Any) -> None:
+        """Write down every setting that decides the results, defaults included.
+
+        Args:
+            settings: A dataclass or mapping.
+
+        Raises:
+            UserError: The run was begun with other settings.
+        """
+        record = self.read_json(CONFIG)
+        new = to_plain(settings)
+        _check_same(self.root, record.get("settings", new), new, "settings")
+        if "settings" not in record:
+            self.write_json(CONFIG, {**record, "settings": new})
+
+    def changed_versions(self) -> list[str]:
+        """List the packages whose version is another than when the run was begun."""
+        before, now = self.read_json(CONFIG)["versions"], versions()
+        return [
+            f"{name} {before.get(name)} -> {now.get(name)}"
+            for name in sorted(before.keys() | now.keys())
+            if before.get(name) != now.get(name)
+        ]
 
     def discard(self) -> None:
         """Remove the folder if nothing came of the run: `config.json` is all that it holds."""
@@ -220,7 +245,12 @@ def _check_same_run(root: Path, record: Mapping[str, Any]) -> None:
     if not is_run(root):
         raise UserError(f"{root} holds no run to resume; give another --out")
     before = json.loads((root / CONFIG).read_text(encoding="utf-8"))
-    old, new = _leaves(before), _leaves(record)
+    for what in ("config", "seeds"):
+        _check_same(root, before[what], record[what], what)
+
+
+def _check_same(root: Path, before: Any, now: Any, what: str) -> None:
+    old, new = _leaves(before, what), _leaves(now, what)
     for name in sorted(old.keys() | new.keys()):
         if old.get(name) != new.get(name):
             raise UserError(
@@ -229,19 +259,13 @@ def _check_same_run(root: Path, record: Mapping[str, Any]) -> None:
             )
 
 
-def _leaves(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Flatten the settings of a record to one entry a setting, named by its path."""
+def _leaves(record: Any, name: str) -> dict[str, Any]:
+    """Flatten settings to one entry a setting, named by its path."""
+    if not isinstance(record, dict) or not record:
+        return {name: record}
     flat: dict[str, Any] = {}
-
-    def visit(prefix: str, value: Any) -> None:
-        if isinstance(value, dict) and value:
-            for key, item in value.items():
-                visit(f"{prefix}.{key}", item)
-        else:
-            flat[prefix] = value
-
-    visit("config", record["config"])
-    visit("seeds", record["seeds"])
+    for key, item in record.items():
+        flat |= _leaves(item, f"{name}.{key}")
     return flat
 
 

@@ -16,20 +16,27 @@ from garat_jax import checkpoint
 from garat_jax.dynamics import Dynamics
 from garat_jax.errors import DivergedError
 from garat_jax.interrupt import deferred_interrupt
+from garat_jax.rollout import Fault
 from garat_jax.runs import RunDirectory
 
 State = TypeVar("State")
 
 CHECKPOINT_SECONDS = 60.0
 REPORT_SECONDS = 5.0
+LARGEST_FAULTY_SHARE = 0.01
+"""Share of a batch's steps in which physics may leave the finite numbers before training stops."""
+FAULTY = "faulty_share"
 DEEP_CHAIN = 5
 """Joints in a chain from which XLA's CPU fusion emitters slow MJX down; see docs/performance.md."""
 FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
 
 
+SECONDS = "seconds.json"
+
+
 @dataclasses.dataclass
 class Seconds:
-    """Wall time so far.
+    """Wall time so far, that of the processes that a resumed run had before included.
 
     Attributes:
         compile: Spent tracing and compiling.
@@ -55,6 +62,13 @@ class Trainer:
     seeds: Sequence[int]
     seconds: Seconds = dataclasses.field(default_factory=Seconds)
     console: Console = dataclasses.field(default_factory=lambda: Console(stderr=True))
+
+    def __post_init__(self) -> None:
+        """Add the time that earlier processes of a resumed run took."""
+        if self.run.resumed and (self.run.root / SECONDS).exists():
+            before = Seconds(**self.run.read_json(SECONDS))
+            self.seconds.compile += before.compile
+            self.seconds.run += before.run
 
     def train(
         self,
@@ -96,7 +110,7 @@ class Trainer:
         try:
             return self._loop(stage, compiled, state, params, first, num_iterations)
         finally:
-            self.seconds.run += time.monotonic() - started
+            self._spent(started)
 
     def call(self, function: Callable, *arguments: Any, options: dict[str, Any] | None = None):
         """Compile a function, call it once, and return its result when it is there."""
@@ -104,8 +118,12 @@ class Trainer:
         started = time.monotonic()
         with deferred_interrupt():
             result = jax.block_until_ready(compiled(*arguments))
-        self.seconds.run += time.monotonic() - started
+        self._spent(started)
         return result
+
+    def _spent(self, started: float) -> None:
+        self.seconds.run += time.monotonic() - started
+        self.run.write_json(SECONDS, self.seconds)
 
     def _compile(self, function: Callable, arguments: tuple, options: dict[str, Any] | None):
         started = time.monotonic()
@@ -123,8 +141,7 @@ class Trainer:
                     iteration, last = progress[0] + 1, progress[1]
                     new, metrics, finite = step(last, params)
                     metrics = {name: np.asarray(value) for name, value in metrics.items()}
-                    if not np.asarray(finite).all():
-                        self._diverged(stage, iteration, last, new, np.asarray(finite))
+                    self._check(stage, iteration, last, new, metrics, np.asarray(finite))
                     self.run.log(iteration, stage=stage, **metrics)
                     progress = (iteration, new)
                     now = time.monotonic()
@@ -159,10 +176,30 @@ class Trainer:
             )
         self.console.print(line, highlight=False)
 
-    def _diverged(self, stage: str, iteration: int, last, offending, finite: np.ndarray):
+    def _check(self, stage: str, iteration: int, last, new, metrics, finite: np.ndarray) -> None:
+        """Stop where a learner is not finite or its worlds fail too often; warn where one does."""
+        if not finite.all():
+            self._diverged(stage, iteration, last, new, ~finite, "stopped being finite at")
+        shares = [value for name, value in metrics.items() if name.endswith(FAULTY)]
+        share = np.max(shares, axis=0) if shares else np.zeros(len(self.seeds))
+        if np.any(share > LARGEST_FAULTY_SHARE):
+            what = (
+                f"saw physics leave the finite numbers in {100 * share.max():.2g} % of the steps "
+                f"(up to {100 * LARGEST_FAULTY_SHARE:g} % is let pass) of"
+            )
+            self._diverged(stage, iteration, last, new, share > LARGEST_FAULTY_SHARE, what)
+        if np.any(share > 0):
+            self.console.print(
+                f"{stage}: warning: physics left the finite numbers in "
+                f"{100 * share.max():.2g} % of the steps of iteration {iteration}; "
+                "those episodes were ended",
+                highlight=False,
+            )
+
+    def _diverged(self, stage: str, iteration: int, last, new, bad: np.ndarray, what: str):
         """Leave the last finite state and the offending one, and say where they are."""
         self._save(self.run.path(f"checkpoints/{stage}"), iteration - 1, last)
-        leaves = jax.tree_util.tree_flatten_with_path(offending)[0]
+        leaves = jax.tree_util.tree_flatten_with_path(new)[0]
         arrays = {
             jax.tree_util.keystr(path): np.asarray(leaf)
             for path, leaf in leaves
@@ -170,11 +207,11 @@ class Trainer:
         }
         path = self.run.path(f"diverged/{stage}-{iteration}.npz")
         np.savez_compressed(path, allow_pickle=False, **arrays)
-        bad = [seed for seed, good in zip(self.seeds, finite, strict=True) if not good]
+        seeds = [seed for seed, is_bad in zip(self.seeds, bad, strict=True) if is_bad]
         raise DivergedError(
-            f"{stage}: seed {', '.join(map(str, bad))} stopped being finite at iteration "
-            f"{iteration}; the last finite state is in checkpoints/{stage}, "
-            f"the offending one in {path}"
+            f"{stage}: seed {', '.join(map(str, seeds))} {what} iteration {iteration}; "
+            f"the last finite state is in checkpoints/{stage}, the offending one, with the first "
+            f"faulty step before and after, in {path}"
         )
 
 
@@ -184,14 +221,20 @@ def _done(stage: str) -> str:
 
 
 def _with_finite(step):
-    """Add to a step's results whether each seed's float leaves are all finite, [seeds]."""
+    """Add to a step's results whether each seed's float leaves are all finite, [seeds].
+
+    The record of a fault holds what was not finite, and is left out.
+    """
+
+    def is_fault(node) -> bool:
+        return isinstance(node, Fault)
 
     def stepped(state, params):
         state, metrics = step(state, params)
         finite = [
             jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1)
-            for leaf in jax.tree.leaves((state, metrics))
-            if jnp.issubdtype(leaf.dtype, jnp.floating)
+            for leaf in jax.tree.leaves((state, metrics), is_leaf=is_fault)
+            if not is_fault(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
         ]
         return state, metrics, jnp.stack(finite).all(axis=0)
 

@@ -216,6 +216,7 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
     task = config.pair.task
     source = make_world(task, config.pair.source, engine=config.engine)
     target = make_world(task, config.pair.target, engine=config.engine)
+    run.record_settings(dataclasses.replace(config, engine=source.params.engine))
     agent = trpo.make(source.env, config.agent)
     trainer = Trainer(run, range(config.first_seed, config.first_seed + config.seeds))
     keys = jax.vmap(jax.random.key)(jnp.asarray(trainer.seeds))
@@ -257,7 +258,7 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
         returns=returns,
         errors=errors,
         curve=[line for line in run.metrics() if line["stage"] == "grounding"],
-        target_transitions=config.num_target_transitions,
+        target_transitions=recorded.transitions.reward[0].size,
         env_steps={
             name: np.asarray(state.env_steps)
             for name, state in (states | {"grounding": grounding.transformer}).items()

@@ -117,14 +117,6 @@ def test_a_fault_of_the_program_keeps_its_traceback(failing):
         cli.main(["fail", "--how", "library"])
 
 
-def test_a_plain_value_error_of_the_package_is_a_users_mistake(failing, monkeypatch, capsys):
-    from garat_jax import checkpoint
-
-    monkeypatch.setattr(Failing, "run", lambda self: checkpoint.restore("nowhere", {}))
-    assert cli.main(["fail"]) == 2
-    assert capsys.readouterr().err == "garat: error: no checkpoint in nowhere\n"
-
-
 def test_a_diverged_run_is_one_line_and_status_1(failing, capsys):
     assert cli.main(["fail", "--how", "diverged"]) == 1
     assert capsys.readouterr().err == "garat: error: step 3, seed 1: the loss is NaN\n"

@@ -37,7 +37,7 @@ def walk(action, length):
 
 @pytest.mark.parametrize(("action", "steps"), [(0.0, 6), (1.0, 5)])
 def test_next_obs_is_what_followed_even_where_an_episode_ended(action, steps):
-    _, transitions = walk(action, 13)
+    _, transitions, _ = walk(action, 13)
     np.testing.assert_allclose(
         transitions.next_obs, transitions.obs + GAIN * action, rtol=1e-6, atol=1e-7
     )
@@ -50,16 +50,54 @@ def test_next_obs_is_what_followed_even_where_an_episode_ended(action, steps):
 
 @pytest.mark.parametrize(("action", "terminates"), [(0.0, False), (1.0, True)])
 def test_the_end_of_the_task_and_the_end_of_time_are_kept_apart(action, terminates):
-    _, transitions = walk(action, 13)
+    _, transitions, _ = walk(action, 13)
     assert not (transitions.terminated & transitions.truncated).any()
     assert bool(transitions.terminated.any()) == terminates
     assert bool(transitions.truncated.any()) != terminates
 
 
 def test_an_unroll_goes_on_where_the_last_one_stopped():
-    state, first = walk(1.0, 3)
+    state, first, _ = walk(1.0, 3)
     np.testing.assert_array_equal(state.obs, first.next_obs[-1])
     np.testing.assert_array_equal(state.steps, [3, 3, 3])
+
+
+class Bursting(Walk):
+    """A walk in which physics fails beyond 0.5, to infinity or to NaN, before the task ends it."""
+
+    def __init__(self, to: float):
+        self.to = to
+
+    def step(self, params, state, action, key):
+        result = super().step(params, state, action, key)
+        obs = jnp.where(result.state.obs > 0.5, self.to, result.state.obs)
+        return result._replace(state=result.state._replace(obs=obs), reward=obs[0])
+
+
+@pytest.mark.parametrize("to", [jnp.inf, jnp.nan, 1e11])
+def test_a_world_that_fails_ends_its_episode_and_is_kept_as_it_was(to):
+    env = Bursting(to)
+    start = rollout.reset(env, PARAMS, jax.random.key(0), 3)
+    state, transitions, fault = jax.jit(
+        lambda: rollout.unroll(env, PARAMS, constant, jnp.ones(()), start, jax.random.key(1), 13)
+    )()
+    failed = np.asarray(transitions.obs + GAIN > 0.5)[..., 0]
+    assert failed.any(axis=0).all()
+    np.testing.assert_array_equal(transitions.terminated, failed)
+    assert not transitions.truncated.any()
+    np.testing.assert_array_equal(transitions.reward[failed], 0)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((state, transitions)))
+    assert fault.num_steps == failed.sum()
+    first = np.argwhere(failed)[0]
+    np.testing.assert_array_equal(fault.before.obs, transitions.obs[tuple(first)])
+    np.testing.assert_array_equal(fault.action, [1.0])
+    np.testing.assert_array_equal(fault.after.obs, [np.float32(to)])
+
+
+def test_a_batch_without_failure_has_an_empty_record():
+    *_, fault = walk(1.0, 13)
+    assert fault.num_steps == 0
+    np.testing.assert_array_equal(fault.before.obs, [0.0])
 
 
 def test_evaluate_counts_only_the_first_episode():

@@ -94,6 +94,27 @@ def test_resume_goes_on_with_the_same_settings_and_names_the_one_that_differs(tm
         create(tmp_path, seeds=[3], resume=True)
 
 
+def test_every_setting_is_written_down_and_held_against_a_resumed_run(tmp_path):
+    run = create(tmp_path)
+    run.record_settings({"inner": Inner(0.1), "engine": "mujoco"})
+    written = run.read_json("config.json")["settings"]
+    assert written == {"inner": {"rate": 0.1}, "engine": "mujoco"}
+    resumed = create(tmp_path, resume=True)
+    resumed.record_settings({"inner": Inner(0.1), "engine": "mujoco"})
+    with pytest.raises(UserError, match=r"settings\.inner\.rate = 0\.1, now it is 0\.2"):
+        resumed.record_settings({"inner": Inner(0.2), "engine": "mujoco"})
+
+
+def test_a_resumed_run_knows_which_versions_changed(tmp_path):
+    run = create(tmp_path)
+    assert run.changed_versions() == []
+    record = run.read_json("config.json")
+    record["versions"]["jax"] = "0.0.1"
+    run.write_json("config.json", record)
+    assert len(run.changed_versions()) == 1
+    assert run.changed_versions()[0].startswith("jax 0.0.1 -> ")
+
+
 def test_resume_of_an_empty_folder_starts_a_run(tmp_path):
     assert not create(tmp_path / "new", resume=True).resumed
 

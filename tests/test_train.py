@@ -7,6 +7,10 @@ import pytest
 from rich.console import Console
 
 from garat_jax import checkpoint, dynamics, train
+from garat_jax.agents import ppo
+from garat_jax.dynamics import Override
+from garat_jax.env import make_world
+from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.errors import DivergedError
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer, UntilSolved
@@ -149,6 +153,57 @@ def test_nan_stops_the_run_and_says_where(tmp_path):
     assert [line["step"] for line in lines(run)] == [1, 2]
 
 
+def failing_worlds(shares):
+    """Return a learner whose worlds fail in the given share of steps at each iteration."""
+
+    def step(count, params):
+        del params
+        return count + 1, {"faulty_share": jnp.asarray(shares)[count]}
+
+    return jax.vmap(step, (0, None)), jnp.zeros(2, jnp.int32)
+
+
+def test_few_failures_of_physics_are_told_and_many_stop_the_run(tmp_path, capsys):
+    step, start = failing_worlds([0.0, 0.005, 0.02])
+    loop = Trainer(directory(tmp_path / "run"), SEEDS)
+    with pytest.raises(DivergedError, match=r"seed 7, 8 saw physics .* 2 % .* iteration 3"):
+        loop.train("worlds", step, start, None, 10)
+    told = " ".join(capsys.readouterr().err.split())
+    assert "warning: physics left the finite numbers in 0.5 % of the steps of iteration 2" in told
+    assert checkpoint.latest_step(loop.run.path("checkpoints/worlds")) == 2
+
+
+def test_the_step_in_which_physics_failed_is_left_as_it_was(tmp_path):
+    strong = Override("actuator", "slide", "gear", 1e13)
+    world = make_world(InvertedPendulum(), (strong,), engine="mujoco")
+    agent = ppo.make(world.env, ppo.PPOConfig(num_envs=4, num_steps=8, hidden=(8,)))
+    keys = jax.vmap(jax.random.key)(jnp.asarray(SEEDS))
+    start = jax.vmap(lambda key: agent.init(key, world.params))(keys)
+    step = jax.vmap(lambda state, params: agent.step(state, params)[:2], (0, None))
+    run = directory(tmp_path / "run")
+    with pytest.raises(DivergedError):
+        trainer(run).train("burst", step, start, world.params, 5)
+    with np.load(run.root / "diverged" / "burst-1.npz", allow_pickle=False) as kept:
+        assert (kept[".fault.num_steps"] > 0).all()
+        before, after = kept[".fault.before.physics.qpos"], kept[".fault.after.physics.qvel"]
+        action = kept[".fault.action"]
+    assert before.shape == (2, 2)
+    assert np.abs(before).max() < 1
+    assert not (np.abs(after) < 1e10).all(axis=1).any()
+    assert np.abs(action).min() > 0
+
+
+def test_the_time_of_a_resumed_run_counts_the_processes_before(tmp_path):
+    step, start = learner()
+    first = trainer(directory(tmp_path / "run"))
+    first.train("walk", step, start, 0.1, 3)
+    second = trainer(directory(tmp_path / "run", resume=True))
+    assert second.seconds == first.seconds
+    second.train("more", step, start, 0.1, 3)
+    assert second.seconds.run > first.seconds.run
+    assert second.seconds.compile > first.seconds.compile
+
+
 def test_a_metric_that_is_not_finite_stops_the_run_too(tmp_path):
     def step(state, params):
         return state + 1, {"loss": jnp.log(2.5 - state)}
@@ -211,8 +266,8 @@ def test_compiler_options_are_for_deep_chains_in_mjx_on_a_cpu(monkeypatch):
     assert train.compiler_options(deep) == {}
 
 
-def test_the_compiler_takes_its_options_or_the_run_stops_here():
-    loop = trainer(run=None)  # pyright: ignore[reportArgumentType]; `call` writes nothing
+def test_the_compiler_takes_its_options_or_the_run_stops_here(tmp_path):
+    loop = trainer(directory(tmp_path / "run"))
     options = train.compiler_options(world(6, "mjx"))
     assert loop.call(lambda x: x + 1, jnp.ones(3), options=options).sum() == 6
 

@@ -58,6 +58,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "changes of up to 2 half-ranges": vary(reach=2.0),
     "discriminator's learning rate 3e-4": vary(learning_rate=3e-4),
     "gradient penalty 1": vary(gradient_penalty=1.0),
+    "no L2 on the weights": vary(weight_penalty=0.0),
+    "L2 on the weights 1e-2": vary(weight_penalty=1e-2),
+    "L2 on the weights 1e-1": vary(weight_penalty=1e-1),
     "1,000 target transitions": {"num_target_transitions": 1000},
 }
 

@@ -11,6 +11,7 @@ from garat_jax import rollout
 from garat_jax.agents import advantage
 from garat_jax.env import Env, EnvState
 from garat_jax.networks import GaussianPolicy, ValueNet, forward
+from garat_jax.rollout import Fault
 from garat_jax.types import Params, Policy, Transition
 
 
@@ -22,12 +23,23 @@ class PolicyParams(NamedTuple):
 
 
 class ActorCriticState(NamedTuple):
-    """Everything that one learner carries from a batch to the next."""
+    """Everything that one learner carries from a batch to the next.
+
+    Attributes:
+        policy: What acts.
+        value: The value network's weights.
+        optimiser: Its state.
+        env: Where the environments stand, [B].
+        fault: What went wrong in the last batch.
+        key: PRNG key.
+        env_steps: Control steps so far, [].
+    """
 
     policy: PolicyParams
     value: Params
     optimiser: optax.OptState
     env: EnvState
+    fault: Fault
     key: jax.Array
     env_steps: jax.Array
 
@@ -54,11 +66,13 @@ def init_state(
     policy_key, value_key, env_key, key = jax.random.split(key, 4)
     obs = jnp.zeros(env.obs_size)
     normaliser = running_statistics.init_state(specs.Array((env.obs_size,), jnp.dtype("float32")))
+    env_state = rollout.reset(env, env_params, env_key, num_envs)
     return ActorCriticState(
         policy=PolicyParams(policy.init(policy_key, obs), normaliser),
         value=value.init(value_key, obs),
         optimiser=(),
-        env=rollout.reset(env, env_params, env_key, num_envs),
+        env=env_state,
+        fault=rollout.no_fault(env, env_state),
         key=key,
         env_steps=jnp.zeros((), jnp.int32),
     )
@@ -91,11 +105,12 @@ def collect(
 ) -> tuple[ActorCriticState, Transition]:
     """Act for `length` steps in every environment with the statistics as they are."""
     key, unroll_key = jax.random.split(state.key)
-    env_state, transitions = rollout.unroll(
+    env_state, transitions, fault = rollout.unroll(
         env, env_params, policy, state.policy, state.env, unroll_key, length
     )
     env_steps = state.env_steps + transitions.reward.size
-    return state._replace(env=env_state, key=key, env_steps=env_steps), transitions
+    state = state._replace(env=env_state, fault=fault, key=key, env_steps=env_steps)
+    return state, transitions
 
 
 def prepare(
@@ -125,12 +140,13 @@ def observe(state: ActorCriticState, transitions: Transition) -> ActorCriticStat
     return state._replace(policy=state.policy._replace(normaliser=updated))
 
 
-def episode_metrics(transitions: Transition) -> dict[str, jax.Array]:
-    """Return the mean reward a step and the mean steps an episode of a batch."""
+def episode_metrics(state: ActorCriticState, transitions: Transition) -> dict[str, jax.Array]:
+    """Return a batch's mean reward a step, mean steps an episode and share of faulty steps."""
     ended = jnp.sum(transitions.terminated | transitions.truncated)
     return {
         "reward": transitions.reward.mean(),
         "episode_length": transitions.reward.size / jnp.maximum(ended, 1),
+        "faulty_share": state.fault.num_steps / transitions.reward.size,
     }
 
 

@@ -79,7 +79,7 @@ def make(env: Env, config: PPOConfig) -> Agent:
             optimiser=optimiser_state,
             key=key,
         )
-        metrics = jax.tree.map(jnp.mean, metrics) | actor_critic.episode_metrics(transitions)
+        metrics = jax.tree.map(jnp.mean, metrics) | actor_critic.episode_metrics(state, transitions)
         return actor_critic.observe(state, transitions), metrics, transitions
 
     return Agent(init, step, policy, mean, config.num_envs * config.num_steps)

@@ -79,7 +79,7 @@ def make(env: Env, config: TRPOConfig) -> Agent:
             optimiser=optimiser_state,
             key=key,
         )
-        metrics = metrics | actor_critic.episode_metrics(transitions)
+        metrics = metrics | actor_critic.episode_metrics(state, transitions)
         metrics["value_loss"] = value_loss.mean()
         return actor_critic.observe(state, transitions), metrics, transitions
 

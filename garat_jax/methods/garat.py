@@ -46,8 +46,8 @@ class GARATConfig:
     learning_rate: float = 1e-3
     num_minibatches: int = 20  # one pass over the batch, as the paper's "update D" is read
     gradient_penalty: float = 10.0  # Desai et al. 2020
-    weight_decay: float = 1e-4  # L2 on the weights, Desai et al. 2020
-    centre_reward: bool = True
+    weight_penalty: float = 1e-3  # L2 on the weights, Desai et al. 2020; size by measurement
+    centre_reward: bool = True  # of no effect where PPO standardises and the discount is 0
 
 
 class Normaliser(NamedTuple):
@@ -96,7 +96,7 @@ class GARAT:
         self.env = TransformerEnv(env, agent, self.decode, self.reward)
         self.transformer = ppo.make(self.env, config.transformer)
         self.grounded = GroundedEnv(env, self.transform)
-        self.optimiser = optax.adamw(config.learning_rate, weight_decay=config.weight_decay)
+        self.optimiser = optax.adam(config.learning_rate)
 
     def transform(
         self, params: PolicyParams, obs: jax.Array, action: jax.Array, key: jax.Array
@@ -139,6 +139,10 @@ class GARAT:
     ) -> tuple[GARATState, Metrics]:
         """Do one adversarial update: the transformer's by PPO, the discriminator's by one pass.
 
+        The transformer is paid by the discriminator of the update before, and the discriminator
+        learns from the transitions that this transformer made: algorithm 1 with its two lines
+        in the order that lets one batch of experience serve both.
+
         Args:
             state: The pair.
             env_params: The source's parameters.
@@ -161,11 +165,13 @@ class GARAT:
 
     def _update_discriminator(self, reward: RewardParams, optimiser, grounded, wanted, key):
         grounded_key, target_key, penalty_key = jax.random.split(key, 3)
-        shape = (self.config.num_minibatches, -1)
-        order = jax.random.permutation(grounded_key, grounded.shape[0])
-        batches = grounded[order].reshape(*shape, grounded.shape[-1])
-        picks = jax.random.randint(target_key, batches.shape[:2], 0, wanted.shape[0])
-        keys = jax.random.split(penalty_key, self.config.num_minibatches)
+        num = self.config.num_minibatches
+        size = grounded.shape[0] // num
+        order = jax.random.permutation(grounded_key, grounded.shape[0])[: num * size]
+        picks = jnp.arange(num * size) % wanted.shape[0]  # each equally often, one pass if alike
+        picks = jax.random.permutation(target_key, picks)
+        batches = [data.reshape(num, size, -1) for data in (grounded[order], wanted[picks])]
+        keys = jax.random.split(penalty_key, num)
 
         def minibatch_step(carry, inputs):
             weights, optimiser = carry
@@ -174,7 +180,7 @@ class GARAT:
             return (optax.apply_updates(weights, updates), optimiser), metrics
 
         (weights, optimiser), metrics = jax.lax.scan(
-            minibatch_step, (reward.weights, optimiser), (batches, wanted[picks], keys)
+            minibatch_step, (reward.weights, optimiser), (*batches, keys)
         )
         mean_reward = jnp.mean(jax.nn.softplus(-forward(self.network, weights, grounded)))
         offset = mean_reward if self.config.centre_reward else jnp.zeros(())
@@ -182,7 +188,7 @@ class GARAT:
         return reward, optimiser, jax.tree.map(jnp.mean, metrics)
 
     def _loss(self, weights: Params, grounded: jax.Array, wanted: jax.Array, key: jax.Array):
-        """Return -(E_grounded[log D] + E_target[log(1 - D)]) plus the gradient penalty, []."""
+        """Return -(E_grounded[log D] + E_target[log(1 - D)]) plus both penalties, []."""
         logits_grounded = forward(self.network, weights, grounded)
         logits_target = forward(self.network, weights, wanted)
         loss = jnp.mean(jax.nn.softplus(-logits_grounded)) + jnp.mean(
@@ -192,11 +198,20 @@ class GARAT:
             lambda x: forward(self.network, weights, x), grounded, wanted, key
         )
         accuracy = (jnp.mean(logits_grounded > 0) + jnp.mean(logits_target < 0)) / 2
-        return loss + self.config.gradient_penalty * penalty, {
+        squares = weight_penalty(weights)
+        total = loss + self.config.gradient_penalty * penalty
+        return total + self.config.weight_penalty * squares, {
             "discriminator_loss": loss,
             "discriminator_accuracy": accuracy,
             "gradient_penalty": penalty,
+            "weight_penalty": squares,
         }
+
+
+def weight_penalty(weights: Params) -> jax.Array:
+    """Return the sum of the squares of all kernels, biases left out, []."""
+    kernels = [leaf for leaf in jax.tree.leaves(weights) if leaf.ndim > 1]
+    return jnp.sum(jnp.stack([jnp.sum(jnp.square(kernel)) for kernel in kernels]))
 
 
 def gradient_penalty(logit, grounded: jax.Array, wanted: jax.Array, key: jax.Array) -> jax.Array:

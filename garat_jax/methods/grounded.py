@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from garat_jax.env import Env, EnvState, StepResult
+from garat_jax.errors import UserError
 from garat_jax.types import Params, Policy
 
 Output = Literal["change", "absolute"]
@@ -134,10 +135,10 @@ def decode_action(
         reach: Largest change, or largest action, in half-ranges.
 
     Raises:
-        ValueError: The environment's actions are not bounded.
+        UserError: The environment's actions are not bounded.
     """
     if not np.isfinite(env.action_low).all() or not np.isfinite(env.action_high).all():
-        raise ValueError("an action transformer needs bounded actions: give actuators a ctrlrange")
+        raise UserError("an action transformer needs bounded actions: give actuators a ctrlrange")
     half_range = (env.action_high - env.action_low) / 2
     middle = (env.action_high + env.action_low) / 2
 

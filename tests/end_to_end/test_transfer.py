@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -84,6 +85,10 @@ def test_it_leaves_a_summary_of_everything(finished):
     assert summary["scaled"].keys() == {"mean", "standard_error", "per_seed"}
     assert summary["controls"].keys() == {"more_source_training", "action_noise"}
     assert summary["target_transitions"] == 40
+    settings = json.loads((root / "config.json").read_text())["settings"]
+    assert settings["engine"] == "mujoco"
+    assert settings["agent"]["discount"] == TRPOConfig().discount
+    assert settings["num_updates"] == 2
     assert summary["seconds"]["compile"] > 0
     assert summary["seconds"]["run"] > 0
 
@@ -114,11 +119,10 @@ def test_a_finished_run_resumed_gives_the_same_numbers(finished):
     assert {**again, "seconds": None} == {**result, "seconds": None}
 
 
-def start_command(out: Path, *options: str) -> subprocess.Popen[str]:
+def start_command(*arguments: str) -> subprocess.Popen[str]:
     program = "import sys; from garat_jax.cli import main; sys.exit(main())"
-    arguments = ["transfer", NAME, "--seeds", "1", "--engine", "mujoco", "--out", str(out)]
     return subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", program, *arguments, *options],
+        [sys.executable, "-W", "ignore", "-c", program, *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -134,18 +138,32 @@ def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> No
         time.sleep(0.05)
 
 
-def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path):
-    out = tmp_path / "run"
-    process = start_command(out)
+def interrupt_after(path: Path, count: int, *arguments: str) -> str:
+    """Run a command until a file has some lines, interrupt it, and return what it complained."""
+    process = start_command(*arguments)
     try:
-        wait_for_lines(out / "metrics.jsonl", 2, process)
+        wait_for_lines(path, count, process)
         process.send_signal(signal.SIGINT)
         _, complaint = process.communicate(timeout=60)
     finally:
         process.kill()
-    last = complaint.splitlines()[-1]
     assert process.returncode == 130, complaint
-    assert last.startswith("garat: interrupted; go on with: garat transfer ")
-    assert last.endswith("--resume")
     assert "Traceback" not in complaint
-    assert (checkpoint.latest_step(out / "checkpoints" / "source policy") or 0) >= 1
+    return complaint
+
+
+@pytest.mark.parametrize(
+    ("command", "folder"),
+    [(["transfer", NAME, "--seeds", "1", "--engine", "mujoco"], "."), (["demo"], "transfer")],
+)
+def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path, command, folder):
+    arguments = [*command, "--out", str(tmp_path / "run")]
+    run = tmp_path / "run" / folder
+    last = interrupt_after(run / "metrics.jsonl", 2, *arguments).splitlines()[-1]
+    assert last == f"garat: interrupted; go on with: {shlex.join(['garat', *arguments])} --resume"
+    reached = checkpoint.latest_step(run / "checkpoints" / "source policy") or 0
+    assert reached >= 1
+    again = interrupt_after(run / "metrics.jsonl", reached + 2, *arguments, "--resume")
+    assert f"source policy: restored after iteration {reached}" in again
+    steps = [json.loads(line)["step"] for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert steps == list(range(1, len(steps) + 1))

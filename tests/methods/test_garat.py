@@ -10,7 +10,14 @@ import pytest
 
 from garat_jax import rollout
 from garat_jax.agents.ppo import PPOConfig
-from garat_jax.methods.garat import GARAT, GARATConfig, Normaliser, features, gradient_penalty
+from garat_jax.methods.garat import (
+    GARAT,
+    GARATConfig,
+    Normaliser,
+    features,
+    gradient_penalty,
+    weight_penalty,
+)
 from garat_jax.methods.grounded import Grounding, TransformerParams
 from garat_jax.methods.transition_error import transition_error
 from tests.probe_envs import Walk, WalkParams
@@ -95,6 +102,21 @@ def test_centred_rewards_have_mean_zero_over_the_batch(told_apart):
     np.testing.assert_allclose(metrics["rewards"].mean(axis=1), 0, atol=1e-4)
     assert metrics["rewards"].std() > 0.01
     assert final.reward.offset > 0
+
+
+def test_the_weights_are_penalised_and_the_biases_are_not():
+    weights = {"kernel": jnp.asarray([[1.0, -2.0]]), "bias": jnp.asarray([7.0])}
+    assert weight_penalty({"layer": weights}) == pytest.approx(5.0)
+
+
+def test_the_penalty_on_weights_keeps_the_discriminator_small():
+    target = flat(record(FAR, 1).transitions)
+    sizes = []
+    for penalty in (0.0, 1.0):
+        garat, state = start(dataclasses.replace(SMALL, weight_penalty=penalty), target)
+        state, _ = jax.jit(garat.step)(state, SOURCE, (), target)
+        sizes.append(weight_penalty(state.reward.weights))
+    assert sizes[1] < 0.95 * sizes[0]
 
 
 def test_gradient_penalty_of_a_linear_logit():
