@@ -21,6 +21,10 @@ START_STEP = 1e-4
 """Finite difference of an initial state, relative to its spread."""
 UNEXCITED = 1e-6
 """Sensitivity, relative to the residual's size at the bounds, below which a direction is frozen."""
+FITTED = 1e-4
+"""Fall of the cost, relative to it, below which a fit has converged."""
+SETTLED = 1e-3
+"""Fall of a segment's cost, relative to it, below which its initial state is left as it is."""
 LARGE = 1e8
 """Whitened residual that stands for a simulation that diverged."""
 
@@ -164,30 +168,42 @@ def difference_steps(problem: Problem, theta: np.ndarray, columns, relative: flo
     return np.asarray(steps)
 
 
-def settle(problem: Problem, theta: np.ndarray, start: np.ndarray, iterations: int = 6) -> Fit:
-    """Estimate the initial state of every segment, damped one by one, at fixed parameters."""
-    return _settle(problem, theta, start, linearise(problem, theta, start, (), ()), iterations)
+def settle(problem: Problem, theta: np.ndarray, start: np.ndarray, iterations: int = 8) -> Fit:
+    """Estimate the initial state of every segment at fixed parameters.
 
-
-def _settle(problem: Problem, theta, start, lin: Linearisation, iterations: int) -> Fit:
+    Each segment has a damping of its own and is done when its linearisation promises no fall of
+    its cost that matters; a step that was rejected is tried again, shorter.
+    """
+    lin = linearise(problem, theta, start, (), ())
     damping = np.full(len(start), 1e-6)
     for _ in range(iterations):
         change = _start_step(lin, lin.residual, damping)
-        trial = linearise(problem, theta, start + change * lin.start_unit, (), ())
-        before, after = np.sum(lin.residual**2, 1), np.sum(trial.residual**2, 1)
-        better = after < before
-        start = np.where(better[:, None], start + change * lin.start_unit, start)
-        lin = Linearisation(
-            np.where(better[:, None], trial.residual, lin.residual),
-            lin.parameters,
-            np.where(better[:, None, None], trial.start, lin.start),
-            lin.start_unit,
-        )
-        damping = np.where(better, damping * 0.1, np.maximum(damping, 1e-5) * 100.0)
-        if np.all(before - after < 1e-3 * before):
+        before = np.sum(lin.residual**2, 1)
+        if np.all(before - _promised(lin, lin.residual, change) < SETTLED * before):
             break
+        starts = start + change * lin.start_unit
+        trial = linearise(problem, theta, starts, (), ())
+        better = np.sum(trial.residual**2, 1) < before
+        start = np.where(better[:, None], starts, start)
+        lin = _choose(better, trial, lin)
+        damping = np.where(better, damping * 0.1, np.maximum(damping, 1e-5) * 100.0)
     nothing = np.zeros(0)
     return Fit(theta, (), (), start, lin.residual, nothing, nothing)
+
+
+def _promised(lin: Linearisation, residual: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return each segment's cost [S] if the initial states' effect on the residual were linear."""
+    return np.sum((residual + np.einsum("sni,si->sn", lin.start, change)) ** 2, axis=1)
+
+
+def _choose(which: np.ndarray, new: Linearisation, old: Linearisation) -> Linearisation:
+    """Take the segments `which` [S] from one linearisation and the others from another."""
+    return Linearisation(
+        np.where(which[:, None], new.residual, old.residual),
+        np.where(which[:, None, None], new.parameters, old.parameters),
+        np.where(which[:, None, None], new.start, old.start),
+        new.start_unit,
+    )
 
 
 def _start_step(lin: Linearisation, residual: np.ndarray, damping: np.ndarray) -> np.ndarray:
@@ -204,7 +220,8 @@ def _start_step(lin: Linearisation, residual: np.ndarray, damping: np.ndarray) -
 def fit(problem: Problem, theta, start, free, iterations: int = 12) -> Fit:
     """Fit some parameters within their bounds, and every initial state.
 
-    Parameters see the fitted segments only; the initial states of those held out follow.
+    Parameters see the fitted segments only. The initial states of those held out follow as long as
+    that lowers their own cost, and are settled at the end.
 
     Args:
         problem: What is fitted.
@@ -220,21 +237,25 @@ def fit(problem: Problem, theta, start, free, iterations: int = 12) -> Fit:
     for _ in range(iterations):
         change, keep = _parameter_step(problem, theta, lin, free, damping)
         expected = lin.residual + lin.parameters @ change
-        starts = start + _start_step(lin, expected, undamped) * lin.start_unit
+        start_change = _start_step(lin, expected, undamped)
+        before = np.sum(lin.residual[problem.fitted] ** 2)
+        promised = _promised(lin, expected, start_change)[problem.fitted].sum()
+        if before - promised < FITTED * before or damping > 1e8:
+            break
+        starts = start + start_change * lin.start_unit
         trial_theta = theta.copy()
         trial_theta[list(free)] += change
         steps = difference_steps(problem, trial_theta, free, STEP)
         trial = linearise(problem, trial_theta, starts, free, steps)
-        before = np.sum(lin.residual[problem.fitted] ** 2)
-        after = np.sum(trial.residual[problem.fitted] ** 2)
-        if after < before:
-            theta, start, lin, damping = trial_theta, starts, trial, damping * 0.1
+        if np.sum(trial.residual[problem.fitted] ** 2) < before:
+            follows = np.sum(trial.residual**2, 1) < np.sum(lin.residual**2, 1)
+            moved = problem.fitted | follows
+            start = np.where(moved[:, None], starts, start)
+            theta, lin, damping = trial_theta, _choose(moved, trial, lin), damping * 0.1
         else:
             damping = max(damping, 1e-3) * 30.0
-        if abs(before - after) < 1e-4 * before or damping > 1e8:
-            break
     low, high = _interval(problem, theta, start, lin, free, keep)
-    settled = _settle(problem, theta, start, lin, 2)
+    settled = settle(problem, theta, start)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
     return Fit(theta, free, frozen, settled.start, settled.residual, low, high)
 
