@@ -190,17 +190,9 @@ def _fit_contenders(problem, current: Fit, scores: Sequence[Score], say) -> list
 
 
 def _fit_with(problem: Problem, current: Fit, score: Score) -> Fit:
-    """Fit the selected effects and one more, from its expected size kept within bounds."""
+    """Fit the selected effects and one more, from where screening puts it."""
     theta = current.theta.copy()
-    for j, size in zip(score.columns, score.size, strict=True):
-        p = problem.simulator.slots[j].parameter
-        theta[j] = np.clip(size, p.low, p.high)
-    first = score.columns[0]
-    base, scale = problem.simulator.base[first], problem.simulator.slots[first].parameter.scale
-    if abs(theta[first] - base) < 1e-3 * scale:
-        theta[first] = base + 0.1 * scale
-    for j in score.columns[1:]:
-        theta[j] = problem.simulator.base[j]
+    theta[list(score.start)] = list(score.start.values())
     return fit(problem, theta, current.start, (*current.free, *score.columns))
 
 

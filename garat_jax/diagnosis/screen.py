@@ -1,13 +1,14 @@
 """Score every candidate effect at the current fit, before any of them is fitted.
 
-A candidate's sensitivity is the change of the predictions at a realistic size of its parameters.
-What initial states and parameters already free can explain is projected out. Evidence is a Wald
-test of what is left after common delay, sensor offsets and the integrator's error too, with
-blocks of time as the independent units (Liang and Zeger 1986) and Holm's correction (1979).
+A candidate's sensitivity is the change of the predictions at a realistic size of its parameters; a
+law with a threshold, which does nothing below it, is tried at several (`Effect.starts`). What
+initial states and parameters already free can explain is projected out. Evidence is a Wald test of
+what is left after common delay, sensor offsets and the integrator's error too, with blocks of time
+as the independent units (Liang and Zeger 1986) and Holm's correction (1979).
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,9 +31,12 @@ VISIBLE = 3.0
 """Whitened change over a parameter's whole range below which the data cannot show it."""
 WORTHWHILE = 0.01
 """Share of the residual that a further parameter of the same effect must explain."""
-DELAYS = ("actuator_delay",)
+DELAYS = ("actuator_delay", "sensor_delay")
 """Kinds that a common delay stands for: it is no nuisance to them."""
-OFFSETS = ("torque_offset", "gravity_scale", "payload_mass")
+OFFSETS = (
+    "torque_offset", "gravity_scale", "gravity_tilt", "payload_mass", "com_offset",
+    "joint_stiffness", "encoder_offset",
+)  # fmt: skip
 """Kinds whose static part an offset of a position sensor imitates: it is no nuisance to them."""
 
 
@@ -44,6 +48,7 @@ class Score:
         effect: Index among the simulator's effects.
         columns: Its parameters' indices in `theta` that the data excite.
         size: Expected values of these parameters.
+        start: Where a fit starts, by column.
         share: Share of the residual's squares that it would explain.
         p_value: Probability of such evidence without the effect, corrected for the number of tests.
         possible: Whether the expected values are physically possible.
@@ -54,6 +59,7 @@ class Score:
     effect: int
     columns: tuple[int, ...]
     size: tuple[float, ...]
+    start: Mapping[int, float]
     share: float
     p_value: float
     possible: bool
@@ -61,13 +67,52 @@ class Score:
     excluded: str = ""
 
 
+class _Row(NamedTuple):
+    """One perturbed simulation.
+
+    Attributes:
+        column: The parameter that is moved last.
+        values: All that is set, by column.
+        step: By how much `column` is moved.
+        below: The row whose change is subtracted; -1 for none.
+    """
+
+    column: int
+    values: dict[int, float]
+    step: float
+    below: int
+
+
+class _Trial(NamedTuple):
+    """One candidate tried at one size.
+
+    Attributes:
+        effect: Index among the simulator's effects.
+        start: What "tried" sets, by column.
+        rows: Indices of the rows that move one parameter each, the first parameter's first.
+        is_only: Whether the law is tried at one size; then sizes are extrapolated from it.
+    """
+
+    effect: int
+    start: dict[int, float]
+    rows: tuple[int, ...]
+    is_only: bool
+
+
 class _Sensitivities(NamedTuple):
-    """Columns on the fitted data, initial states and free parameters removed, [M, k] each."""
+    """What the fitted data say once initial states and free parameters are removed.
+
+    Attributes:
+        residual: [M].
+        changes: Of each row, [M, rows].
+        delay: Columns of a common delay, [M, 0 or 1].
+        offsets: Of an offset of each position sensor, [M, nq].
+        integrator: Of the integrator's error, [M, 1].
+        labels: Block of each residual, [M].
+    """
 
     residual: np.ndarray
-    candidates: dict[int, np.ndarray]
-    columns: dict[int, tuple[int, ...]]
-    steps: dict[int, float]
+    changes: np.ndarray
     delay: np.ndarray
     offsets: np.ndarray
     integrator: np.ndarray
@@ -82,15 +127,23 @@ def screen(problem: Problem, fit: Fit, skip: Sequence[int] = ()) -> list[Score]:
         fit: The current fit.
         skip: Indices of effects that are in the model already.
     """
-    sensitivities = _measure(problem, fit, skip)
-    raw = [_score(problem, sensitivities, i) for i in sensitivities.candidates]
-    judged = [score for score in raw if not score.excluded]
+    rows, trials = _plan(problem.simulator, fit.theta, skip)
+    sensitivities = _measure(problem, fit, rows, trials)
+    raw: dict[int, Score] = {}
+    for trial in trials:
+        score = _score(problem, sensitivities, rows, trial)
+        best = raw.get(trial.effect)
+        if best is None or (not score.excluded, score.possible, score.share) > (
+            not best.excluded, best.possible, best.share
+        ):  # fmt: skip
+            raw[trial.effect] = score
+    judged = [score for score in raw.values() if not score.excluded]
     order = np.argsort([score.p_value for score in judged])
     adjusted, largest = {}, 0.0
     for rank, index in enumerate(order):
         largest = max(largest, min(1.0, judged[index].p_value * (len(judged) - rank)))
         adjusted[judged[index].effect] = largest
-    scores = [dataclasses.replace(s, p_value=adjusted.get(s.effect, 1.0)) for s in raw]
+    scores = [dataclasses.replace(s, p_value=adjusted.get(s.effect, 1.0)) for s in raw.values()]
     return sorted(scores, key=lambda s: (bool(s.excluded), not s.possible, -s.share))
 
 
@@ -100,71 +153,67 @@ def cosine(a: Score, b: Score) -> float:
     return float(abs(a.contribution @ b.contribution) / size) if size > 0 else 0.0
 
 
-def _perturbations(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list, np.ndarray]:
-    """Return (column, switch or None, step) for each thing to perturb; columns may come twice."""
-    listed = []
-    for j, slot in enumerate(simulator.slots):
-        if slot.effect in skip:
+def _plan(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], list[_Trial]]:
+    """List what to simulate: each candidate at each of its sizes, then its other parameters."""
+    rows: list[_Row] = []
+    trials = []
+    for index, effect in enumerate(simulator.effects):
+        columns = [j for j, slot in enumerate(simulator.slots) if slot.effect == index]
+        if index in skip or not columns:
             continue
-        first = next(k for k, s in enumerate(simulator.slots) if s.effect == slot.effect)
-        listed.append((j, None))
-        if j != first:
-            listed.append((j, first))
-    steps = []
-    for j, _ in listed:
-        p = simulator.slots[j].parameter
-        steps.append(p.scale if theta[j] + p.scale <= p.high else -p.scale)
-    return listed, np.asarray(steps)
+        names = {simulator.slots[j].parameter.name: j for j in columns}
+        starts = effect.starts(simulator.host, effect.target)
+        for given in starts:
+            start = {names[name]: value for name, value in given.items()}
+            if len(starts) == 1 and len(start) == 1:
+                step = _step_within(simulator, columns[0], theta[columns[0]])
+                start = {columns[0]: theta[columns[0]] + step}
+            first = len(rows)
+            rows.append(_Row(columns[0], start, start[columns[0]] - theta[columns[0]], -1))
+            chosen = [first]
+            for j in columns[1:]:
+                base = start[j] if j in start else float(theta[j])
+                step = _step_within(simulator, j, base)
+                if len(start) == 1:
+                    rows.append(_Row(j, {j: base + step}, step, -1))
+                chosen.append(len(rows))
+                rows.append(_Row(j, {**start, j: base + step}, step, first))
+            trials.append(_Trial(index, start, tuple(chosen), len(starts) == 1))
+    return rows, trials
 
 
-def _measure(problem: Problem, fit: Fit, skip) -> _Sensitivities:
+def _step_within(simulator: Simulator, column: int, value: float) -> float:
+    p = simulator.slots[column].parameter
+    return p.scale if value + p.scale <= p.high else -p.scale
+
+
+def _measure(problem: Problem, fit: Fit, rows: list[_Row], trials: list[_Trial]) -> _Sensitivities:
     simulator, segments, fitted = problem.simulator, problem.segments, problem.fitted
     steps = difference_steps(problem, fit.theta, fit.free, 1e-2)
     lin = linearise(problem, fit.theta, fit.start, fit.free, steps)
-    listed, steps = _perturbations(simulator, fit.theta, skip)
-    thetas = np.tile(fit.theta, (len(listed), 1))
-    for row, (j, switch) in enumerate(listed):
-        thetas[row, j] += steps[row]
-        if switch is not None:
-            thetas[row, switch] += simulator.slots[switch].parameter.scale
-    starts = np.tile(fit.start, (len(listed), 1, 1))
-    changes = problem.whiten(simulator.predict(thetas, starts, segments)) - lin.residual
-    for row, (_, switch) in enumerate(listed):
-        if switch is not None:
-            changes[row] -= changes[listed.index((switch, None))]
+    thetas = np.tile(fit.theta, (len(rows), 1))
+    for theta, row in zip(thetas, rows, strict=True):
+        theta[list(row.values)] = list(row.values.values())
+    starts = np.broadcast_to(fit.start, (len(rows), *fit.start.shape))
+    moved = problem.whiten(simulator.predict(thetas, starts, segments))
+    changes = moved - lin.residual
+    for change, row in zip(changes, rows, strict=True):
+        if row.below >= 0:
+            change -= moved[row.below] - lin.residual
     integrator = problem.integrator_error(fit.theta, fit.start, lin.residual)
     nuisances = np.stack([integrator, *_offsets(problem)])
     remove = _Remover(lin, fitted)
-    columns, candidates = {}, {}
-    for effect in dict.fromkeys(simulator.slots[j].effect for j, _ in listed):
-        chosen = _choose_rows(simulator, listed, changes, effect)
-        columns[effect] = tuple(listed[row][0] for row in chosen)
-        candidates[effect] = remove(changes[chosen])
-    delays = [i for i in candidates if simulator.effects[i].kind in DELAYS]
-    common = [i for i in delays if simulator.effects[i].target == "all"] or delays[:1]
-    nuisances = remove(nuisances)
-    nothing = np.zeros((len(nuisances), 0))
+    changes, nuisances = remove(changes), remove(nuisances)
+    delays = [t for t in trials if simulator.effects[t.effect].kind in DELAYS]
+    common = [t for t in delays if simulator.effects[t.effect].target == "all"] or delays[:1]
     return _Sensitivities(
         residual=remove(lin.residual[None])[:, 0],
-        candidates=candidates,
-        columns=columns,
-        steps=dict(zip((j for j, _ in listed), steps, strict=True)),
-        delay=candidates[common[0]] if common else nothing,
+        changes=changes,
+        delay=changes[:, [t.rows[0] for t in common[:1]]],
         offsets=nuisances[:, 1:],
         integrator=nuisances[:, :1],
         labels=block_labels(problem)[fitted].ravel(),
     )
-
-
-def _choose_rows(simulator: Simulator, listed, changes, effect: int) -> list[int]:
-    """Choose for each parameter its change alone, or switched on where alone it does nothing."""
-    rows: dict[int, int] = {}
-    for row, (j, switch) in enumerate(listed):
-        if simulator.slots[j].effect != effect:
-            continue
-        if switch is None or not np.any(changes[rows[j]]):
-            rows[j] = row
-    return list(rows.values())
 
 
 def _offsets(problem: Problem) -> np.ndarray:
@@ -209,41 +258,72 @@ def _without(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
     return columns - basis @ (basis.T @ columns)
 
 
-def _score(problem: Problem, s: _Sensitivities, effect: int) -> Score:
-    simulator = problem.simulator
-    matrix, columns = s.candidates[effect], s.columns[effect]
-    steps = np.asarray([s.steps[j] for j in columns])
-    slots = [simulator.slots[j].parameter for j in columns]
-    change = np.linalg.norm(matrix, axis=0) / np.abs(steps)
-    seen = change * np.asarray([p.high - p.low for p in slots]) > VISIBLE
-    seen &= np.linalg.norm(matrix, axis=0) > 1e-3 * np.linalg.norm(matrix, axis=0).max(initial=0.0)
+def _score(problem: Problem, s: _Sensitivities, rows: list[_Row], trial: _Trial) -> Score:
+    """Judge one candidate at one size."""
+    chosen = _choose_rows(s, rows, trial)
+    slots = [problem.simulator.slots[rows[i].column].parameter for i in chosen]
+    matrix = s.changes[:, chosen]
+    norm = np.linalg.norm(matrix, axis=0)
+    steps = np.abs([rows[i].step for i in chosen])
+    width = np.asarray([p.high - p.low for p in slots]) if trial.is_only else steps
+    seen = norm * np.maximum(width / steps, 1.0) > VISIBLE
+    seen &= norm > 1e-3 * norm.max(initial=0.0)
     if not seen[0]:
-        name = slots[0].name
-        reason = f"the recordings do not excite it: its {name} changes no signal"
-        return Score(effect, columns, (), 0.0, 1.0, False, matrix[:, 0], reason)
-    needed = _needed(matrix, s.residual, seen)
-    columns, matrix, steps = tuple(columns[i] for i in needed), matrix[:, needed], steps[needed]
+        reason = f"the recordings do not excite it: its {slots[0].name} changes no signal"
+        columns = tuple(rows[i].column for i in chosen)
+        return Score(trial.effect, columns, (), {}, 0.0, 1.0, False, matrix[:, 0], reason)
+    given = [k for k, i in enumerate(chosen) if rows[i].column in trial.start and seen[k]]
+    needed = _needed(matrix, s.residual, seen, given)
+    chosen, matrix = [chosen[i] for i in needed], matrix[:, needed]
     factor = np.linalg.lstsq(matrix, -s.residual, rcond=1e-6)[0]
     contribution = matrix @ factor
     total = float(s.residual @ s.residual)
     share = 1.0 - float(np.sum((s.residual + contribution) ** 2)) / total if total > 0 else 0.0
-    base = np.asarray([simulator.slots[j].base for j in columns])
-    size = base + factor * steps
-    if len(columns) > 1:  # the first parameter switches the effect on and multiplies the others
-        size[1:] = base[1:] + factor[1:] * steps[1:] * steps[0] / (size[0] - base[0] or steps[0])
-    first = slots[0]
-    possible = bool(first.low - 1e-12 <= size[0] <= first.high + abs(first.scale))
-    kind = simulator.effects[effect].kind
+    size, start, possible = _size(problem.simulator, rows, trial, chosen, factor)
+    kind = problem.simulator.effects[trial.effect].kind
     nuisances = [s.integrator]
     nuisances += [] if kind in DELAYS else [s.delay]
     nuisances += [] if kind in OFFSETS else [s.offsets]
     p_value = _wald(matrix, s.residual, _orthonormal(np.concatenate(nuisances, 1)), s.labels)
-    return Score(effect, columns, tuple(size), share, p_value, possible, contribution)
+    columns = tuple(rows[i].column for i in chosen)
+    return Score(trial.effect, columns, size, start, share, p_value, possible, contribution)
 
 
-def _needed(matrix: np.ndarray, residual: np.ndarray, seen: np.ndarray) -> list[int]:
-    """Return the first column and, one by one, those that explain a worthwhile part more."""
-    chosen, others = [0], [i for i in range(1, len(seen)) if seen[i]]
+def _choose_rows(s: _Sensitivities, rows: list[_Row], trial: _Trial) -> list[int]:
+    """Choose for each parameter its change alone, or switched on where alone it does nothing."""
+    chosen = []
+    for i in trial.rows:
+        alone = i - 1
+        is_free = rows[i].below >= 0 and rows[alone].values.keys() == {rows[i].column}
+        chosen.append(alone if is_free and np.any(s.changes[:, alone]) else i)
+    return chosen
+
+
+def _size(simulator: Simulator, rows: list[_Row], trial: _Trial, chosen: list[int], factor):
+    """Return the expected values of the chosen rows, where a fit starts, and if it is possible.
+
+    Where the first parameter switches an effect on, it multiplies the others. A law with a
+    threshold is no multiple of itself: it keeps the size at which it was tried.
+    """
+    columns = [rows[i].column for i in chosen]
+    base, first = simulator.base[columns], simulator.slots[columns[0]].parameter
+    if not trial.is_only:
+        kept = [trial.start[j] if j in trial.start else float(simulator.base[j]) for j in columns]
+        return tuple(kept), trial.start, bool(factor[0] > 0)
+    size = base + factor * [rows[i].step for i in chosen]
+    switched = np.asarray([rows[i].below >= 0 for i in chosen])
+    multiplier = (size[0] - base[0]) / rows[chosen[0]].step or 1.0
+    size = np.where(switched, base + (size - base) / multiplier, size)
+    possible = bool(first.low - 1e-12 <= size[0] <= first.high + abs(first.scale))
+    start = float(np.clip(size[0], first.low, first.high))
+    if abs(start - base[0]) < 1e-3 * first.scale:
+        start = base[0] + 0.1 * first.scale
+    return tuple(float(value) for value in size), {columns[0]: start}, possible
+
+
+def _needed(matrix: np.ndarray, residual: np.ndarray, seen: np.ndarray, given) -> list[int]:
+    """Return the given columns and, one by one, those that explain a worthwhile part more."""
+    chosen, others = list(given), [i for i in range(len(seen)) if seen[i] and i not in given]
     while others:
         basis = _orthonormal(matrix[:, chosen])
         rest = _without(residual[:, None], basis)[:, 0]
