@@ -14,6 +14,8 @@ from garat_jax.errors import UserError
 from garat_jax.setconst import CONSTANT_INPUTS
 
 STATE_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")
+KEPT_BATCHES = 8
+"""Batches of simulations that are kept for the next call."""
 INPUTS = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
 
 
@@ -55,6 +57,32 @@ class HostModel:
             forces: Generalised forces, shaped alike [.., nv].
             num_substeps: Physics substeps.
         """
+        function = functools.partial(self._advance_batch, num_substeps)
+        result = self._call(function, (sum(self.sizes),), fields, state, commands, forces)
+        time, *parts = jnp.split(result, np.cumsum(self.sizes)[:-1])
+        return type(state)(time[0], *parts, memory=state.memory)
+
+    def trace(self, fields, state, commands, forces, num_steps: int, num_substeps: int):
+        """Step one simulation (a batch under `vmap`) through many commands in one call.
+
+        Args:
+            fields: As for `advance`.
+            state: A `PhysicsState`.
+            commands: [num_steps * num_substeps, nu], or [num_steps, nu] to hold each.
+            forces: Generalised forces, shaped alike [.., nv].
+            num_steps: Control steps.
+            num_substeps: Physics substeps of each.
+
+        Returns:
+            qpos and qvel after each control step, [num_steps, nq + nv].
+        """
+        repeat = num_steps * num_substeps // commands.shape[0]
+        shape = (num_steps, self.model.nq + self.model.nv)
+        function = functools.partial(self._trace_batch, num_substeps, repeat)
+        return self._call(function, shape, fields, state, commands, forces)
+
+    def _call(self, function, shape: tuple[int, ...], fields, state, commands, forces):
+        """Call back with a batch of simulations, everything as 32-bit words."""
         if self.model.nhistory or self.model.nplugin:
             raise UserError("engine mujoco does not carry plugins or native delays; use mjx")
         row = jnp.concatenate(
@@ -64,23 +92,19 @@ class HostModel:
         inputs = {"row": row, "control": control, **fields}
         words = row.dtype.itemsize // 4
         result = jax.pure_callback(
-            functools.partial(self._advance_words, num_substeps, str(row.dtype)),
-            jax.ShapeDtypeStruct((sum(self.sizes) * words,), jnp.uint32),
+            functools.partial(self._on_host, function, str(row.dtype)),
+            jax.ShapeDtypeStruct((int(np.prod(shape)) * words,), jnp.uint32),
             {name: _to_words(value.astype(row.dtype)) for name, value in inputs.items()},
             vmap_method="expand_dims",
         )
-        time, *parts = jnp.split(_from_words(result, row.dtype), np.cumsum(self.sizes)[:-1])
-        return type(state)(time[0], *parts, memory=state.memory)
+        return _from_words(result, row.dtype).reshape(shape)
 
-    def _advance_words(self, num_substeps: int, dtype: str, words) -> np.ndarray:
+    def _on_host(self, function, dtype: str, words) -> np.ndarray:
         fields = {name: np.ascontiguousarray(value).view(dtype) for name, value in words.items()}
         row, control = fields.pop("row"), fields.pop("control")
         control = control.reshape(*control.shape[:-1], -1, self.model.nu + self.model.nv)
         shapes = {name: _field_shape(self.model, name) for name in fields}
         fields = {name: v.reshape(*v.shape[:-1], *shapes[name]) for name, v in fields.items()}
-        return self._advance_batch(num_substeps, row, control, fields, shapes).view(np.uint32)
-
-    def _advance_batch(self, num_substeps: int, row, control, fields, shapes) -> np.ndarray:
         leading = np.broadcast_shapes(
             row.shape[:-1],
             control.shape[:-2],
@@ -92,30 +116,48 @@ class HostModel:
             _write_fields(batch, fields, shapes, leading)
             _write_state(batch, np.broadcast_to(row, leading + row.shape[-1:]), num)
             controls = np.broadcast_to(control, leading + control.shape[-2:])
-            controls = controls.reshape(num, *control.shape[-2:])
-            if control.shape[-2] == 1:
-                nu = self.model.nu
-                batch.bind("ctrl")[:] = controls[:, 0, :nu]
-                batch.bind("qfrc_applied")[:] = controls[:, 0, nu:]
-                batch.step(nstep=num_substeps)
-            else:
-                batch.rollout(num_substeps, controls, int(INPUTS), record=())
-            parts = [batch.bind(name).reshape(num, -1) for name in (*STATE_FIELDS, "sensordata")]
+            result = function(batch, controls.reshape(num, *control.shape[-2:]))
             with np.errstate(over="ignore"):  # what exploded is infinite in 32 bits
-                result = np.concatenate(parts, axis=1).astype(row.dtype)
-        return result.reshape(*leading, -1)
+                result = result.astype(row.dtype)
+        return result.reshape(*leading, -1).view(np.uint32)
+
+    def _advance_batch(self, num_substeps: int, batch: Batch, controls) -> np.ndarray:
+        """Step a batch under controls [num, substeps or 1, nu + nv]; return its rows."""
+        if controls.shape[1] == 1:
+            nu = self.model.nu
+            batch.bind("ctrl")[:] = controls[:, 0, :nu]
+            batch.bind("qfrc_applied")[:] = controls[:, 0, nu:]
+            batch.step(nstep=num_substeps)
+        else:
+            batch.rollout(num_substeps, controls, int(INPUTS), record=())
+        num = len(controls)
+        parts = [batch.bind(name).reshape(num, -1) for name in (*STATE_FIELDS, "sensordata")]
+        return np.concatenate(parts, axis=1)
+
+    def _trace_batch(self, num_substeps: int, repeat: int, batch: Batch, controls) -> np.ndarray:
+        """Step a batch under controls [num, .., nu + nv], each held for `repeat` substeps."""
+        controls = np.repeat(controls, repeat, axis=1)
+        found = batch.rollout(controls.shape[1], controls, int(INPUTS), record=("qpos", "qvel"))
+        path = np.concatenate([found["qpos"], found["qvel"]], axis=2)
+        return path[:, num_substeps - 1 :: num_substeps]
 
     @functools.cached_property
     def _batches(self) -> dict:
         return {}
 
     def _batch(self, num: int, fields: frozenset[str]) -> Batch:
-        """Return the simulations for a batch size; each set of changed fields has its own."""
-        if (num, fields) not in self._batches:
+        """Return the simulations for a batch size; each set of changed fields has its own.
+
+        The ones used last are kept.
+        """
+        batch = self._batches.pop((num, fields), None)
+        if batch is None:
             batch = Batch(self.model, num)
             batch.bind("sensordata")
-            self._batches[num, fields] = batch
-        return self._batches[num, fields]
+        self._batches[num, fields] = batch
+        while len(self._batches) > KEPT_BATCHES:
+            del self._batches[next(iter(self._batches))]
+        return batch
 
 
 def _to_words(values: jax.Array) -> jax.Array:
