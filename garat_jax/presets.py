@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from garat_jax.agents.ppo import PPOConfig
 from garat_jax.methods.garat import GARATConfig
+from garat_jax.methods.gat import GATConfig
 from garat_jax.transfer import Pair, TransferConfig
 
 
@@ -20,10 +21,18 @@ def garat_paper(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferCon
         num_minibatches=1,
         centre_reward=False,
     )
-    return TransferConfig(pair, "garat_paper", seeds=seeds, engine=engine, garat=settings)
+    return TransferConfig(pair, "garat_paper", seeds=seeds, engine=engine, grounding=settings)
+
+
+def gat(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferConfig:
+    """GAT, the paper's baseline: a forward model of the target, an inverse one of the source."""
+    return TransferConfig(
+        pair, "gat", seeds=seeds, engine=engine, grounding=GATConfig(), num_updates=20
+    )
 
 
 METHODS: dict[str, Callable[..., TransferConfig]] = {
     "garat": garat,
     "garat_paper": garat_paper,
+    "gat": gat,
 }

@@ -19,13 +19,14 @@ from garat_jax.agents.actor_critic import ActorCriticState, PolicyParams
 from garat_jax.agents.trpo import TRPOConfig
 from garat_jax.dynamics import Override
 from garat_jax.env import Env, Task, World, make_world
-from garat_jax.methods.garat import GARAT, GARATConfig, GARATState
+from garat_jax.methods.garat import GARAT, GARATConfig
+from garat_jax.methods.gat import GAT, GATConfig
 from garat_jax.methods.grounded import GroundedEnv, Grounding
 from garat_jax.methods.transition_error import constant_errors, transition_error
 from garat_jax.rollout import Recorded
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer, UntilSolved
-from garat_jax.types import Agent, Params
+from garat_jax.types import Agent, Params, Policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,9 +58,9 @@ class TransferConfig:
     first_seed: int = 0
     engine: str = "auto"
     agent: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
-    garat: GARATConfig = dataclasses.field(default_factory=GARATConfig)
+    grounding: GARATConfig | GATConfig = dataclasses.field(default_factory=GARATConfig)
     max_iterations: int = 200  # of training a policy until it solves its world
-    num_updates: int = 50  # adversarial updates, Desai et al. 2020
+    num_updates: int = 50  # of the action transformer, Desai et al. 2020
     num_retraining: int = 60  # iterations of the agent in the grounded source
     num_target_transitions: int = 5000
     action_noise: float = 0.135  # half-ranges: the transformer's initial standard deviation
@@ -183,19 +184,19 @@ class Experiment:
     def ground(self, agent_policy: PolicyParams, recorded: Recorded, held_out: Recorded):
         """Learn action transformers [seeds]; return the method and their final states."""
         source, agent = self.worlds.source, self.worlds.agent
-        garat = GARAT(source.env, agent.policy, self.config.garat)
+        method = make_method(source.env, agent.policy, self.config.grounding)
         target = jax.tree.map(
             lambda x: x.reshape(x.shape[0], x.shape[1] * x.shape[2], *x.shape[3:]),
             recorded.transitions,
         )
         arguments = (_fold(self.keys, "grounding"), source.params, agent_policy, target)
-        start = self.map(garat.init, *arguments, axes=(0, None, 0, 0))
+        start = self.map(method.init, *arguments, axes=(0, None, 0, 0))
 
-        def step(state: GARATState, params):
+        def step(state, params):
             env_params, agent_policy, target, held_out, source_error = params
-            state, metrics = garat.step(state, env_params, agent_policy, target)
+            state, metrics = method.step(state, env_params, agent_policy, target)
             grounding = Grounding(env_params, state.transformer.policy)
-            error = transition_error(garat.grounded, grounding, held_out)
+            error = transition_error(method.grounded, grounding, held_out)
             return state, metrics | {"error": error, "error_ratio": error / source_error}
 
         source_error = self.source_error(held_out)
@@ -203,12 +204,19 @@ class Experiment:
         axes = (None, 0, 0, 0, 0)
         updates = self.config.num_updates
         state = self.train("grounding", step, start, params, updates, source, axes)
-        return garat, state
+        return method, state
 
     def source_error(self, held_out: Recorded) -> jax.Array:
         """Return the ungrounded source's transition error, [seeds]."""
         source = self.worlds.source
         return self.map(lambda data: transition_error(source.env, source.params, data), held_out)
+
+
+def make_method(env: Env, agent: Policy, config: GARATConfig | GATConfig) -> GARAT | GAT:
+    """Build the method that a config belongs to, for a source and a fixed agent's policy."""
+    if isinstance(config, GATConfig):
+        return GAT(env, agent, config)
+    return GARAT(env, agent, config)
 
 
 def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
@@ -226,12 +234,16 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
     target_state = experiment.solve("target policy", target).state
     recorded = experiment.record(source_state.policy, "target transitions")
     held_out = experiment.record(source_state.policy, "held-out transitions")
-    garat, grounding = experiment.ground(source_state.policy, recorded, held_out)
+    method, grounding = experiment.ground(source_state.policy, recorded, held_out)
 
     transformer = grounding.transformer.policy
     axes = Grounding(None, 0)
     grounded_state = experiment.retrain(
-        "grounded policy", garat.grounded, Grounding(source.params, transformer), source_state, axes
+        "grounded policy",
+        method.grounded,
+        Grounding(source.params, transformer),
+        source_state,
+        axes,
     )
     more_state = experiment.retrain("more source training", source.env, source.params, source_state)
     noisy = GroundedEnv(source.env, _action_noise(source.env, config.action_noise))
@@ -248,7 +260,7 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
     returns = {
         name: experiment.target_returns(state.policy, name) for name, state in states.items()
     }
-    errors = _errors(experiment, garat, transformer, recorded, held_out)
+    errors = _errors(experiment, method.grounded, transformer, recorded, held_out)
     result = summary.summarise(
         pair=config.pair.name,
         method=config.method,
@@ -288,22 +300,22 @@ def _action_noise(env: Env, scale: float):
 
 def _errors(
     experiment: Experiment,
-    garat: GARAT,
-    transformer: PolicyParams,
+    grounded: Env,
+    transformer: Params,
     recorded: Recorded,
     held_out: Recorded,
 ) -> dict[str, np.ndarray]:
     """Return held-out transition errors [seeds] of source, grounded source and baselines."""
     source = experiment.worlds.source
 
-    def errors(transformer: PolicyParams, recorded: Recorded, held_out: Recorded):
+    def errors(transformer: Params, recorded: Recorded, held_out: Recorded):
         best = jnp.argmin(constant_errors(source.env, source.params, recorded))
         transitions = held_out.transitions
         still = transitions._replace(action=jnp.zeros_like(transitions.action))
         grounding = Grounding(source.params, transformer)
         return {
             "source": transition_error(source.env, source.params, held_out),
-            "grounded": transition_error(garat.grounded, grounding, held_out),
+            "grounded": transition_error(grounded, grounding, held_out),
             "zero_action": transition_error(
                 source.env, source.params, held_out._replace(transitions=still)
             ),

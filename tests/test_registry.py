@@ -14,8 +14,8 @@ from garat_jax.effects import CATALOGUE
 from garat_jax.env import make_world
 from garat_jax.envs import ENVS
 from garat_jax.envs.pairs import PAIRS
-from garat_jax.methods.garat import GARAT
 from garat_jax.presets import METHODS
+from garat_jax.transfer import make_method
 from tests.models import ARM, spec
 
 QUICK = ("inverted_pendulum",)
@@ -106,7 +106,7 @@ def test_every_preset_fits_every_pair(name, pair):
         name, 3, PAIRS[pair], "mujoco",
     )  # fmt: skip
     source = make_world(config.pair.task, config.pair.source, engine="mujoco")
-    GARAT(source.env, lambda params, obs, key: (obs[:1], key), config.garat)
+    make_method(source.env, lambda params, obs, key: (obs[:1], key), config.grounding)
     assert config.agent.num_envs * config.agent.num_steps >= config.agent.value_minibatch
     assert config.num_target_transitions % config.agent.num_envs == 0
 

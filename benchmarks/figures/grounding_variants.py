@@ -33,12 +33,13 @@ from garat_jax.train import Trainer
 from garat_jax.transfer import Experiment, TransferConfig, Worlds
 
 DEFAULT = GARATConfig()
+PAPER = garat_paper(PAIRS["inverted_pendulum_heavy"])
 PAPER_PPO = PPOConfig(initial_log_std=DEFAULT.transformer.initial_log_std)
 
 
 def vary(**changes: Any) -> dict[str, Any]:
     """Return changes to a TransferConfig that change the default GARATConfig."""
-    return {"garat": dataclasses.replace(DEFAULT, **changes)}
+    return {"grounding": dataclasses.replace(DEFAULT, **changes)}
 
 
 def vary_ppo(**changes: Any) -> dict[str, Any]:
@@ -48,7 +49,9 @@ def vary_ppo(**changes: Any) -> dict[str, Any]:
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
-    "the paper read literally": {"garat": garat_paper(PAIRS["inverted_pendulum_heavy"]).garat},
+    "the paper read literally": {
+        "grounding": garat_paper(PAIRS["inverted_pendulum_heavy"]).grounding
+    },
     "rewards not centred": vary(centre_reward=False),
     "one discriminator step an update": vary(num_minibatches=1),
     "the paper's PPO, initial deviation small": vary(transformer=PAPER_PPO),

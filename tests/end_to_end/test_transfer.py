@@ -41,10 +41,10 @@ def tiny() -> TransferConfig:
     return dataclasses.replace(
         preset,
         agent=TRPOConfig(**small, cg_iterations=3, value_epochs=1, value_minibatch=32),
-        garat=dataclasses.replace(
-            preset.garat,
+        grounding=dataclasses.replace(
+            preset.grounding,
             transformer=dataclasses.replace(
-                preset.garat.transformer, **small, num_epochs=1, num_minibatches=2
+                preset.grounding.transformer, **small, num_epochs=1, num_minibatches=2
             ),
             hidden=(8,),
             num_minibatches=2,
