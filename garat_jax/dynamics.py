@@ -122,19 +122,24 @@ class Override:
 
 
 def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:
+    """Scale a body's inertial and its geoms: the compiler decides which of them counts."""
     if mass <= 0:
         raise UserError(f"body/{body.name} mass must be positive, not {mass:g} kg")
     ratio = mass / float(spec.copy().compile().body(body.name).mass[0])
-    if body.explicitinertial:
-        body.mass = mass
-        body.inertia = body.inertia * ratio
-        body.fullinertia = body.fullinertia * ratio
-        return
+    body.mass = body.mass * ratio
+    body.inertia = body.inertia * ratio
+    body.fullinertia = body.fullinertia * ratio
     for geom in body.geoms:
         if geom.mass > 0:
             geom.mass = geom.mass * ratio
         else:
             geom.density = geom.density * ratio
+    compiled = float(spec.copy().compile().body(body.name).mass[0])
+    if abs(compiled - mass) > 1e-6 * mass:
+        raise UserError(
+            f"body/{body.name} mass is {compiled:g} kg whatever is asked for: "
+            "settotalmass or boundmass of the model's compiler overrules it"
+        )
 
 
 def load_spec(mjcf: str | Path) -> mujoco.MjSpec:
@@ -225,7 +230,7 @@ def initial_state(dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array) -> Physi
     """Return the state at rest in memory and activation for a position and velocity."""
     host = dynamics.host.model
     dtype = qpos.dtype
-    return PhysicsState(
+    state = PhysicsState(
         time=jnp.zeros((), dtype),
         qpos=qpos,
         qvel=qvel,
@@ -234,12 +239,28 @@ def initial_state(dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array) -> Physi
         sensordata=jnp.zeros(host.nsensordata, dtype),
         memory=tuple(effect.init(host) for effect in dynamics.effects),
     )
+    return note(dynamics, state, 0.0)
+
+
+def sensed(dynamics: Dynamics, state: PhysicsState) -> PhysicsState:
+    """Return the state with the qpos and qvel that the sensors report; `sensordata` stays true.
+
+    The effects' order is the signal's: of a scale before an offset comes scale * q + offset.
+    """
+    for effect, memory in zip(dynamics.effects, state.memory, strict=True):
+        state = effect.sense(dynamics.host.model, state, memory)
+    return state
+
+
+def sensor_lag(dynamics: Dynamics) -> jax.Array | float:
+    """Return the seconds by which all sensors are late."""
+    return sum((effect.sensor_lag() for effect in dynamics.effects), 0.0)
 
 
 def step(
     dynamics: Dynamics, state: PhysicsState, ctrl: jax.Array, num_substeps: int = 1
 ) -> PhysicsState:
-    """Hold a command for some physics substeps.
+    """Hold a command for some physics substeps, and let the sensors note where that led.
 
     Args:
         dynamics: The physics.
@@ -247,6 +268,14 @@ def step(
         ctrl: Command, [nu].
         num_substeps: Substeps of the model's timestep.
     """
+    state = move(dynamics, state, ctrl, num_substeps)
+    return note(dynamics, state, num_substeps * dynamics.timestep)
+
+
+def move(
+    dynamics: Dynamics, state: PhysicsState, ctrl: jax.Array, num_substeps: int = 1
+) -> PhysicsState:
+    """Do the first half of `step`: no sensor has noted the result yet."""
     model = view(dynamics)
     constants = _constants(dynamics, model)
     if not any(effect.reads_state for effect in dynamics.effects):
@@ -260,6 +289,18 @@ def step(
         return state._replace(memory=memory), None
 
     return jax.lax.scan(substep, state, length=num_substeps)[0]
+
+
+def note(dynamics: Dynamics, state: PhysicsState, seconds: float) -> PhysicsState:
+    """Let every sensor note the state at the end of a control step of so many seconds."""
+    if not any(effect.senses for effect in dynamics.effects):
+        return state
+    host, reported, memories = dynamics.host.model, state, []
+    for effect, memory in zip(dynamics.effects, state.memory, strict=True):
+        memory = effect.note(host, reported, seconds, memory)
+        reported = effect.sense(host, reported, memory)
+        memories.append(memory)
+    return state._replace(memory=tuple(memories))
 
 
 def _act(dynamics: Dynamics, model: ModelView, state, ctrl, memories):

@@ -106,7 +106,10 @@ class Env(abc.ABC):
 
 
 class TaskEnv(Env):
-    """A task on physics: the world that agents act in; `params` are its `Dynamics`."""
+    """A task on physics: the world that agents act in; `params` are its `Dynamics`.
+
+    The policy sees what the sensors report; reward and termination judge the truth.
+    """
 
     def __init__(self, task: Task, world: Dynamics):
         host = world.host.model
@@ -122,7 +125,7 @@ class TaskEnv(Env):
         """Start an episode at a state drawn by the task."""
         qpos, qvel = self.task.initial(params.host.model, key)
         physics = dynamics.initial_state(params, qpos, qvel)
-        return EnvState(physics, self.task.observe(physics), jnp.zeros((), jnp.int32))
+        return EnvState(physics, self._observe(params, physics), jnp.zeros((), jnp.int32))
 
     def step(
         self, params: Dynamics, state: EnvState, action: jax.Array, key: jax.Array
@@ -135,8 +138,12 @@ class TaskEnv(Env):
         terminated = self.task.terminated(physics)
         steps = state.steps + 1
         truncated = (steps >= self.episode_length) & ~terminated
-        after = EnvState(physics, self.task.observe(physics), steps)
+        after = EnvState(physics, self._observe(params, physics), steps)
         return StepResult(after, reward, terminated, truncated)
+
+    def _observe(self, params: Dynamics, physics: PhysicsState) -> jax.Array:
+        """Return the observation [obs_size] of what the sensors report."""
+        return self.task.observe(dynamics.sensed(params, physics))
 
 
 @dataclasses.dataclass(frozen=True)

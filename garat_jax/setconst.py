@@ -1,7 +1,8 @@
 """Constants that MuJoCo derives from a model's masses and inertias, in JAX.
 
 MuJoCo's compiler scales constraints by inverse weights at the reference pose; a mass that
-is changed on the MJX model leaves them stale. `set_const` recomputes them as `mj_setConst` does.
+is changed on the MJX model leaves them stale. `set_const` recomputes those that MJX 3.17 reads, as
+`mj_setConst` does. It reads neither `dof_M0` nor `stat.meaninertia`: these stay as compiled.
 """
 
 import jax
@@ -19,7 +20,7 @@ CONSTANT_INPUTS = frozenset(
 
 
 def set_const(model: mjx.Model, host: mujoco.MjModel) -> mjx.Model:
-    """Return the model with subtree masses and inverse weights that fit its masses.
+    """Return the model with subtree masses, inverse weights and muscles that fit its masses.
 
     Args:
         model: The MJX model with changed fields.
@@ -28,12 +29,16 @@ def set_const(model: mjx.Model, host: mujoco.MjModel) -> mjx.Model:
     data = mjx.make_data(host).replace(qpos=model.qpos0)
     data = mjx.kinematics(model, data)
     data = mjx.com_pos(model, data)
+    data = mjx.tendon(model, data)
     data = mjx.crb(model, data)
+    data = mjx.tendon_armature(model, data)
     inverse = jnp.linalg.inv(mjx.full_m(model, data)) if host.nv else jnp.zeros((0, 0))
     return model.replace(
         body_subtreemass=_subtree_mass(model.body_mass, host),
         dof_invweight0=_average(jnp.diagonal(inverse), host),
         body_invweight0=_body_inverse_weight(model, data, inverse, host),
+        tendon_invweight0=_tendon_inverse_weight(data, inverse),
+        actuator_acc0=_actuator_acceleration(model, data, inverse),
     )
 
 
@@ -70,3 +75,15 @@ def _body_inverse_weight(model, data, inverse: jax.Array, host: mujoco.MjModel) 
     moving = jnp.asarray(host.body_weldid > 0)
     all_weights = jax.vmap(weights)(data.xipos, jnp.arange(host.nbody))
     return jnp.where(moving[:, None], all_weights, 0.0)
+
+
+def _tendon_inverse_weight(data, inverse: jax.Array) -> jax.Array:
+    """Return J M^-1 J^T of each tendon, [ntendon]."""
+    J = data._impl.ten_J
+    return jnp.einsum("ti,ij,tj->t", J, inverse, J)
+
+
+def _actuator_acceleration(model, data, inverse: jax.Array) -> jax.Array:
+    """Return the acceleration of a unit force of each actuator, which scales muscles, [nu]."""
+    moment = mjx.transmission(model, data)._impl.actuator_moment
+    return jnp.linalg.norm(moment @ inverse, axis=1)

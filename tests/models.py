@@ -48,6 +48,43 @@ TUMBLER = """
 </mujoco>
 """
 
+SLIDER = """
+<mujoco>
+  <option timestep="0.002" iterations="50" ls_iterations="50"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1" friction="0.6"/>
+    <body name="puck" pos="0 0 -0.2005">
+      <joint name="up" type="slide" axis="0 0 1"/>
+      <joint name="along" type="slide" axis="1 0 0"/>
+      <geom name="ball" type="sphere" size="0.1" mass="0.5" friction="0.4" solref="0.03 1"/>
+    </body></worldbody>
+  <actuator><motor name="push" joint="along"/></actuator>
+</mujoco>
+"""
+
+MUSCLE = """
+<mujoco>
+  <worldbody><body name="upper">
+    <joint name="shoulder" axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/>
+    <site name="origin" pos="0.1 0 0"/>
+    <body name="forearm" pos="0.4 0 0">
+      <joint name="elbow" axis="0 1 0"/><geom size="0.05" pos="0.2 0 0"/>
+      <site name="insertion" pos="0.1 0 0.1"/>
+    </body></body></worldbody>
+  <tendon>
+    <fixed name="cable" limited="true" range="-0.1 0.1" armature="0.1">
+      <joint joint="shoulder" coef="1"/><joint joint="elbow" coef="-0.5"/></fixed>
+    <spatial name="biceps"><site site="origin"/><site site="insertion"/></spatial>
+  </tendon>
+  <actuator><muscle tendon="biceps" lengthrange="0.1 1"/></actuator>
+</mujoco>
+"""
+
+
+def showing(kind: str) -> str:
+    """Return a model on which an effect of the catalogue shows."""
+    return SLIDER if kind.startswith("contact_") else ARM
+
 
 def spec(mjcf: str) -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(mjcf)

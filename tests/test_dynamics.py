@@ -11,7 +11,7 @@ from garat_jax.dynamics import Override
 from garat_jax.effects import CATALOGUE, ActuatorDelay, PayloadMass, RotorInertia, ViscousDamping
 from garat_jax.errors import UserError
 from garat_jax.setconst import set_const
-from tests.models import ARM, PENDULUM, TUMBLER, spec
+from tests.models import ARM, MUSCLE, PENDULUM, TUMBLER, showing, spec
 
 SIZES = {
     "viscous_damping": {"coefficient": 0.2},
@@ -21,7 +21,15 @@ SIZES = {
     "motor_gain": {"scale": 0.7},
     "actuator_delay": {"delay": 0.013},
     "payload_mass": {"mass": 0.5, "x": 0.1, "y": 0.02, "z": -0.05},
+    "com_offset": {"x": 0.05, "y": -0.02, "z": 0.1},
+    "air_drag": {"coefficient": 0.8},
     "gravity_scale": {"scale": 0.5},
+    "gravity_tilt": {"roll": 0.2, "pitch": -0.3},
+    "contact_friction": {"sliding": 0.2},
+    "contact_compliance": {"time_constant": 0.05, "damping_ratio": 0.4},
+    "encoder_scale": {"scale": 1.1},
+    "encoder_offset": {"offset": 0.1},
+    "sensor_delay": {"delay": 0.013},
 }
 
 
@@ -31,18 +39,14 @@ def _float64():
         yield
 
 
-def target_of(kind: str, mjcf: str = ARM) -> str:
-    return CATALOGUE[kind].targets(spec(mjcf).compile())[-1]
-
-
 def make(kind: str, nominal: bool = False):
-    cls = CATALOGUE[kind]
-    values = {p.name: p.nominal for p in cls.parameters()} if nominal else SIZES[kind]
-    return cls(target=target_of(kind), **values)
+    cls, host = CATALOGUE[kind], spec(showing(kind)).compile()
+    target = cls.targets(host)[-1]
+    return cls(target=target, **(cls.at(host, target) if nominal else SIZES[kind]))
 
 
 def simulate(world: dynamics.Dynamics, num_steps: int = 40, num_substeps: int = 3) -> np.ndarray:
-    """Return qpos and qvel [num_steps, nq + nv] under a fixed command."""
+    """Return the sensed qpos and qvel [num_steps, nq + nv] under a fixed command."""
     host = world.host.model
     state = dynamics.initial_state(
         world, jnp.asarray(host.qpos0) + 0.3, jnp.linspace(-0.5, 0.5, host.nv)
@@ -51,7 +55,8 @@ def simulate(world: dynamics.Dynamics, num_steps: int = 40, num_substeps: int = 
     def control_step(state, t):
         ctrl = 0.5 * jnp.sin(0.7 * t + jnp.arange(host.nu))
         state = dynamics.step(world, state, ctrl, num_substeps)
-        return state, jnp.concatenate([state.qpos, state.qvel])
+        reported = dynamics.sensed(world, state)
+        return state, jnp.concatenate([reported.qpos, reported.qvel])
 
     return np.asarray(
         jax.jit(lambda s: jax.lax.scan(control_step, s, jnp.arange(num_steps)))(state)[1]
@@ -65,16 +70,17 @@ def compiled(mjcf: str, *effects, engine: str, overrides=()):
 @pytest.mark.parametrize("kind", CATALOGUE)
 def test_both_engines_agree_with_every_effect(kind):
     effect = make(kind)
-    mjx, c = (simulate(compiled(ARM, effect, engine=e)) for e in ("mjx", "mujoco"))
+    mjx, c = (simulate(compiled(showing(kind), effect, engine=e)) for e in ("mjx", "mujoco"))
     np.testing.assert_allclose(mjx, c, rtol=1e-4, atol=2e-5)
 
 
 @pytest.mark.parametrize("engine", ["mjx", "mujoco"])
 @pytest.mark.parametrize("kind", CATALOGUE)
 def test_an_effect_at_its_nominal_is_the_identity_and_elsewhere_is_not(kind, engine):
-    plain = simulate(compiled(ARM, engine=engine), 10)
-    nominal = simulate(compiled(ARM, make(kind, nominal=True), engine=engine), 10)
-    present = simulate(compiled(ARM, make(kind), engine=engine), 10)
+    mjcf = showing(kind)
+    plain = simulate(compiled(mjcf, engine=engine), 10)
+    nominal = simulate(compiled(mjcf, make(kind, nominal=True), engine=engine), 10)
+    present = simulate(compiled(mjcf, make(kind), engine=engine), 10)
     np.testing.assert_allclose(nominal, plain, atol=1e-6)
     assert np.abs(present - plain).max() > 1e-3
 
@@ -115,7 +121,7 @@ def test_vmap_over_states_and_parameters_is_a_loop(engine):
     assert batched[0, 0, 0] > batched[2, 0, 0]
 
 
-@pytest.mark.parametrize("mjcf", [ARM, TUMBLER])
+@pytest.mark.parametrize("mjcf", [ARM, TUMBLER, MUSCLE], ids=["arm", "tumbler", "muscle"])
 def test_set_const_is_what_mujoco_computes(mjcf):
     from mujoco import mjx
 
@@ -124,7 +130,8 @@ def test_set_const_is_what_mujoco_computes(mjcf):
     changed = set_const(mjx.put_model(model).replace(body_mass=jnp.asarray(mass)), model)
     model.body_mass[:] = mass
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    for name in ("body_subtreemass", "dof_invweight0", "body_invweight0"):
+    weights = ("dof_invweight0", "body_invweight0", "tendon_invweight0")
+    for name in ("body_subtreemass", "actuator_acc0", *weights):
         np.testing.assert_allclose(getattr(changed, name), getattr(model, name), rtol=1e-6)
 
 

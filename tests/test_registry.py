@@ -16,7 +16,7 @@ from garat_jax.envs import ENVS
 from garat_jax.envs.pairs import PAIRS
 from garat_jax.presets import METHODS
 from garat_jax.transfer import make_method
-from tests.models import ARM, spec
+from tests.models import showing, spec
 
 QUICK = ("inverted_pendulum",)
 """Environments that MJX compiles within seconds on a CPU."""
@@ -87,10 +87,11 @@ def test_every_pair_has_two_worlds_that_differ(name):
 @pytest.mark.parametrize("name", CATALOGUE)
 def test_every_effect_can_be_added_wherever_it_says(name):
     kind = CATALOGUE[name]
-    targets = kind.targets(spec(ARM).compile())
+    model = spec(showing(name))
+    targets = kind.targets(model.compile())
     assert targets
     for target in targets:
-        world = dynamics.compile(spec(ARM), effects=(kind(target),), engine="mujoco")
+        world = dynamics.compile(model, effects=(kind(target),), engine="mujoco")
         assert world.effects[0].target == target
     for parameter in kind.parameters():
         assert parameter.low <= parameter.nominal <= parameter.high

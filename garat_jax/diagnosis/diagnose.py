@@ -123,8 +123,7 @@ def _every(r: Recording, step: int) -> Recording:
 def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
     """Make every effect of the catalogue at every place of a model, each without effect.
 
-    A payload hangs at its body's centre of mass until its place is fitted. With one actuator,
-    `all` is that actuator.
+    With one actuator, `all` is that actuator.
     """
     present = {(effect.kind, effect.target) for effect in model.effects}
     candidates = []
@@ -133,11 +132,7 @@ def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
             alone = target == "all" and "actuator" in cls.elements and host.nu < 2
             if alone or (kind, target) in present:
                 continue
-            values = {p.name: p.nominal for p in cls.parameters()}
-            if kind == "payload_mass":
-                place = host.body(target.partition("/")[2]).ipos
-                values.update(zip("xyz", (float(v) for v in place), strict=True))
-            candidates.append(cls(target=target, **values))
+            candidates.append(cls(target=target, **cls.at(host, target)))
     return tuple(candidates)
 
 

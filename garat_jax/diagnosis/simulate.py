@@ -294,24 +294,36 @@ class Simulator:
             return np.asarray(result)[:num, ..., : segments.measured.shape[2]]
 
     def _predict(self, theta, start, ctrl, place):
-        """Predict one segment, [L, nq + nv]."""
+        """Predict what the sensors report of one segment, [L, nq + nv].
+
+        During the warm-up the mechanism is held at its start. It is let go, within a step where
+        need be, as long before the first sample as the sensors are late: what they report there
+        is then the start, and all that they report later was simulated.
+        """
         own = self._world.effects[: self._num_own]
         world = self._world.replace(effects=own + self.with_parameters(theta))
         num_position = self.host.nq
         state = dynamics.initial_state(world, start[:num_position], start[num_position:])
+        interval = self._substeps * world.timestep
+        late = dynamics.sensor_lag(world) / interval
+
+        def reported(state):
+            state = dynamics.sensed(world, state)
+            return jnp.concatenate([state.qpos, state.qvel])
 
         def advance(state, inputs):
             index, command = inputs
-            begins = index == self._warm_up
-            state = state._replace(
-                qpos=jnp.where(begins, start[:num_position], state.qpos),
-                qvel=jnp.where(begins, start[num_position:], state.qvel),
+            moved = dynamics.move(world, state, command, self._substeps)
+            free = jnp.clip(index + 1 - self._warm_up + late, 0.0, 1.0)
+            moved = moved._replace(
+                qpos=jnp.where(free < 1, state.qpos + free * (moved.qpos - state.qpos), moved.qpos),
+                qvel=jnp.where(free < 1, state.qvel + free * (moved.qvel - state.qvel), moved.qvel),
             )
-            state = dynamics.step(world, state, command, self._substeps)
-            return state, jnp.concatenate([state.qpos, state.qvel])
+            moved = dynamics.note(world, moved, interval)
+            return moved, reported(moved)
 
         _, path = jax.lax.scan(advance, state, (jnp.arange(len(ctrl)), ctrl))
-        path = jnp.concatenate([start[None], path[self._warm_up :]])
+        path = jnp.concatenate([reported(state)[None], path[self._warm_up :]])
         if self._on_grid:
             return path
         below = jnp.minimum(place.astype(int), len(path) - 2)

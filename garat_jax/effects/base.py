@@ -116,9 +116,10 @@ class Effect(abc.ABC):
     """A physical effect at one place of a model.
 
     A subclass is a `flax.struct.dataclass` whose parameters are pytree leaves, so an effect can be
-    fitted, batched and differentiated. It says what it does in up to three ways:
+    fitted, batched and differentiated. It says what it does in up to four ways:
     `prepare` changes structure before the model is compiled, `fields` replaces native model
-    fields (both engines), `apply` changes commands and adds forces in every physics substep.
+    fields (both engines), `apply` changes commands and adds forces in every physics substep,
+    `sense` changes what is reported of the state.
 
     Attributes:
         target: Where it acts: `joint/NAME`, `actuator/NAME`, `body/NAME`, `geom/NAME`, `world`,
@@ -129,10 +130,16 @@ class Effect(abc.ABC):
     elements: ClassVar[tuple[str, ...]]
     law: ClassVar[str]
     identified_by: ClassVar[str]
+    needs: ClassVar[str] = "a hinge or slide joint"
+    """What a place must be, for the message that refuses another."""
     acts: ClassVar[bool] = False
     """Whether `apply` does anything; effects that are native fields alone leave it out."""
     reads_state: ClassVar[bool] = False
     """Whether `apply` reads the physics state, which costs an engine call per substep."""
+    senses: ClassVar[bool] = False
+    """Whether `sense` does anything: the effect is one of sensors, not of the motion."""
+    independent: ClassVar[bool] = False
+    """Whether every parameter acts alone; otherwise the first one switches the others on."""
 
     target: str = struct.field(pytree_node=False)
 
@@ -184,7 +191,16 @@ class Effect(abc.ABC):
         if element in OBJECT_TYPES:
             element_id(host, element, name)
             if not self.fits(host, element, name):
-                raise UserError(f"{self.kind} cannot act on {self.target!r}: not a one-dof joint")
+                raise UserError(f"{self.kind} cannot act on {self.target!r}: it needs {self.needs}")
+
+    @classmethod
+    def at(cls, host: mujoco.MjModel, target: str) -> Mapping[str, float]:
+        """Return the parameters that mean "no effect" at a place of a model.
+
+        The nominal values, unless a parameter stands in place of a number of the model.
+        """
+        del host, target
+        return {p.name: p.nominal for p in cls.parameters()}
 
     @classmethod
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
@@ -197,9 +213,8 @@ class Effect(abc.ABC):
             host: The compiled model: ranges of commands and forces.
             target: Where the effect would act.
         """
-        del host, target
         first = cls.parameters()[0]
-        return ({first.name: first.nominal + first.scale},)
+        return ({first.name: cls.at(host, target)[first.name] + first.scale},)
 
     def export(self, spec: mujoco.MjSpec) -> str:
         """Write the effect into a spec as plain MJCF, as far as MJCF can say it.
@@ -242,6 +257,27 @@ class Effect(abc.ABC):
         """
         del model, state
         return ctrl, None, memory
+
+    def note(self, host: mujoco.MjModel, state: Any, seconds: float, memory: Any) -> Any:
+        """Return the memory after a control step, for `sense`; at the start `seconds` is 0.
+
+        Args:
+            host: The compiled model.
+            state: The `PhysicsState` as the sensors before this effect report it.
+            seconds: Time since the last call.
+            memory: What `init` or the last call returned.
+        """
+        del host, state, seconds
+        return memory
+
+    def sense(self, host: mujoco.MjModel, state: Any, memory: Any) -> Any:
+        """Return the `PhysicsState` with qpos and qvel as sensors with this effect report them."""
+        del host, memory
+        return state
+
+    def sensor_lag(self) -> jax.Array | float:
+        """Return the seconds by which all sensors are late."""
+        return 0.0
 
 
 def unit_at(parameter: Parameter, host: mujoco.MjModel, target: str) -> str:

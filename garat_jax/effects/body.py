@@ -1,13 +1,16 @@
-"""Effects at a body: a payload that the model does not know."""
+"""Effects at a body: a payload, a centre of mass that is elsewhere, and the air's drag."""
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from flax import struct
 
 from garat_jax.effects.base import Effect, ModelView, element_id, parameter
+from garat_jax.effects.kinematics import centre_of_mass
 
 SMALLEST_MASS = 1e-9
 """Mass [kg] and inertia [kg m²] of the payload's body when the model is compiled."""
@@ -25,6 +28,7 @@ class PayloadMass(Effect):
     elements: ClassVar[tuple[str, ...]] = ("body",)
     law: ClassVar[str] = "point mass m at (x, y, z) in the body's frame"
     identified_by: ClassVar[str] = "motion against gravity in several poses"
+    needs: ClassVar[str] = "a body that moves"
 
     mass: jax.Array = parameter(
         0.0,
@@ -49,21 +53,162 @@ class PayloadMass(Effect):
         """The name of the payload's own body."""
         return f"{self.name}_payload"
 
+    @classmethod
+    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
+        """Say whether the body moves."""
+        return bool(name) and moves(host, name)
+
+    @classmethod
+    def at(cls, host: mujoco.MjModel, target: str) -> Mapping[str, float]:
+        """Hang the payload at the body's centre of mass until its place is fitted."""
+        place = (float(value) for value in host.body(target.partition("/")[2]).ipos)
+        return {"mass": 0.0, **dict(zip("xyz", place, strict=True))}
+
     def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Weld a body of negligible mass to the target."""
-        spec.body(self.name).add_body(
+        """Weld a body of negligible mass to the target, which the compiler may not fuse."""
+        self._add_body(spec, [0.0, 0.0, 0.0], SMALLEST_MASS).fuse = False
+        spec.body(self.name).simple = False
+
+    def fields(self, model: ModelView) -> dict[str, jax.Array]:
+        """Give the payload's body its mass and place, whatever bounds the compiler set."""
+        index = element_id(model.host, "body", self.payload)
+        return {
+            "body_mass": model["body_mass"].at[index].set(self.mass),
+            "body_inertia": model["body_inertia"].at[index].set(0.0),
+            "body_pos": model["body_pos"].at[index].set(_vector(self)),
+        }
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Add the payload as a body with an inertial of its own."""
+        if float(self.mass) > 0:
+            self._add_body(spec, [float(v) for v in _vector(self)], float(self.mass))
+        return ""
+
+    def _add_body(self, spec: mujoco.MjSpec, place: list[float], mass: float) -> Any:
+        return spec.body(self.name).add_body(
             name=self.payload,
+            pos=place,
             ipos=[0.0, 0.0, 0.0],
             explicitinertial=True,
-            mass=SMALLEST_MASS,
+            mass=mass,
             inertia=[SMALLEST_MASS] * 3,
         )
 
+
+@struct.dataclass
+class ComOffset(Effect):
+    """A body's centre of mass is elsewhere in the body; its mass and inertia about it stay.
+
+    Shows as gravity torque that is wrong with a shifted phase while fast motion is nearly right.
+    Typical: millimetres to a few centimetres, from batteries, cables and hollow parts that CAD
+    fills (domain randomisation of legged robots uses up to 5 cm).
+    """
+
+    kind: ClassVar[str] = "com_offset"
+    elements: ClassVar[tuple[str, ...]] = ("body",)
+    law: ClassVar[str] = "p_com ← p_com + (x, y, z) in the body's frame"
+    identified_by: ClassVar[str] = "static poses all around; slow motion against gravity"
+    needs: ClassVar[str] = "a body that moves and has mass"
+    independent: ClassVar[bool] = True
+
+    x: jax.Array = parameter(
+        0.0, unit="m", low=-0.5, high=0.5, scale=5e-3, source="Within the link of a robot"
+    )
+    y: jax.Array = parameter(
+        0.0, unit="m", low=-0.5, high=0.5, scale=5e-3, source="Within the link of a robot"
+    )
+    z: jax.Array = parameter(
+        0.0, unit="m", low=-0.5, high=0.5, scale=5e-3, source="Within the link of a robot"
+    )
+
+    @classmethod
+    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
+        """Say whether the body moves and has mass."""
+        return bool(name) and moves(host, name) and host.body(name).mass[0] > 0
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Keep the compiler from taking the centre of mass for the body's origin."""
+        spec.body(self.name).simple = False
+
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
-        """Give the payload's body its mass and place."""
-        index = element_id(model.host, "body", self.payload)
-        place = jnp.stack([jnp.asarray(v) for v in (self.x, self.y, self.z)])
-        return {
-            "body_mass": model["body_mass"].at[index].set(self.mass),
-            "body_pos": model["body_pos"].at[index].set(place),
-        }
+        """Move the body's inertial frame."""
+        index = element_id(model.host, "body", self.name)
+        return {"body_ipos": model["body_ipos"].at[index].add(_vector(self))}
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Write the body's inertial out, which the compiler may have made of geoms, and move it."""
+        write_inertials(spec, self.name)
+        body = spec.body(self.name)
+        body.ipos = body.ipos + np.asarray(_vector(self), float)
+        return ""
+
+
+@struct.dataclass
+class AirDrag(Effect):
+    """Drag of the air at a body's centre of mass: F = -c * |v| * v, the air standing still.
+
+    Shows as decay that is fast at large speeds and dies out with them, so that a swing never
+    seems to stop. Identified by motion at two amplitudes. Typical: half of density (1.2 kg/m³)
+    times drag coefficient (0.5 to 1.2) times area: 0.004 for a hand, 0.05 for a quadrotor.
+    """
+
+    kind: ClassVar[str] = "air_drag"
+    elements: ClassVar[tuple[str, ...]] = ("body",)
+    law: ClassVar[str] = "F = −c·|v|·v at the centre of mass"
+    identified_by: ClassVar[str] = "free decay or constant-speed runs at two amplitudes"
+    needs: ClassVar[str] = "a body that moves and has mass"
+    acts: ClassVar[bool] = True
+    reads_state: ClassVar[bool] = True
+
+    coefficient: jax.Array = parameter(
+        0.0,
+        unit="N s²/m²",
+        low=0.0,
+        high=10.0,
+        scale=5e-3,
+        source="0.5 * 1.2 kg/m³ * C_d * A, with areas of up to 10 m²",
+    )
+
+    @classmethod
+    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
+        """Say whether the body moves and has mass."""
+        return ComOffset.fits(host, element, name)
+
+    def apply(self, model: ModelView, state: Any, ctrl: jax.Array, memory: Any):
+        """Map the force at the centre of mass onto the degrees of freedom."""
+        index = element_id(model.host, "body", self.name)
+
+        def place(displacement: jax.Array) -> jax.Array:
+            return centre_of_mass(model, index, state.qpos, displacement)
+
+        still = jnp.zeros_like(state.qvel)
+        velocity = jax.jvp(place, (still,), (state.qvel,))[1]
+        squared = velocity @ velocity
+        speed = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+        (force,) = jax.vjp(place, still)[1](-self.coefficient * speed * velocity)
+        return ctrl, force, memory
+
+
+def moves(host: mujoco.MjModel, body: str) -> bool:
+    """Say whether joints let a body move."""
+    return bool(host.body(body).weldid[0] > 0)
+
+
+def write_inertials(spec: mujoco.MjSpec, name: str) -> None:
+    """Make a body's compiled inertial explicit; every body's, where geoms would overrule it."""
+    copy = spec.copy()
+    host = copy.compile()
+    from_geoms = mujoco.mjtInertiaFromGeom
+    overruled = spec.compiler.inertiafromgeom == from_geoms.mjINERTIAFROMGEOM_TRUE
+    spec.compiler.inertiafromgeom = from_geoms.mjINERTIAFROMGEOM_AUTO
+    for body, copied in zip(spec.bodies, copy.bodies, strict=True):
+        compiled = host.body(copied.id)
+        if compiled.mass[0] > 0 and (overruled or body.name == name):
+            body.explicitinertial = True
+            body.mass, body.ipos = compiled.mass[0], compiled.ipos
+            body.iquat, body.inertia = compiled.iquat, compiled.inertia
+            body.fullinertia = [float("nan")] * 6
+
+
+def _vector(effect: PayloadMass | ComOffset) -> jax.Array:
+    return jnp.stack([jnp.asarray(value) for value in (effect.x, effect.y, effect.z)])

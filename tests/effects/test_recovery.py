@@ -1,0 +1,151 @@
+"""Parameters are recovered from data that plain C MuJoCo made at a 32nd of the timestep.
+
+The truth uses neither the catalogue nor the engine: native fields, forces and late rows.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.diagnose import make_candidates
+from garat_jax.diagnosis.fit import Problem, fit
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.simulate import Simulator, choose_grid, cut
+from tests.models import PENDULUM, SLIDER, spec
+
+REFINEMENT = 32
+RATE = 250.0
+
+
+def nothing(*_) -> None:
+    """Leave it as it is."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One hidden effect: its true parameters, and how plain MuJoCo has it."""
+
+    mjcf: str
+    kind: str
+    truth: Mapping[str, float]
+    change: Callable[[mujoco.MjModel], None] = nothing
+    force: Callable[[mujoco.MjModel, mujoco.MjData], None] = nothing
+    report: Callable[[np.ndarray], np.ndarray] = lambda states: states
+    late: float = 0.0
+    target: str = ""
+    rel: float = 0.02
+
+
+def shift_com(model: mujoco.MjModel) -> None:
+    model.body_sameframe[:] = 0
+    model.body_ipos[1] += [0.04, 0.0, -0.02]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def tilt(model: mujoco.MjModel) -> None:
+    model.opt.gravity[:] = [-9.81 * np.sin(0.1), 0.0, -9.81 * np.cos(0.1)]
+
+
+def drag(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacBodyCom(model, data, jacobian, None, 1)
+    velocity = jacobian @ data.qvel
+    data.qfrc_applied[:] = -0.4 * np.linalg.norm(velocity) * jacobian.T @ velocity
+
+
+def slippery(model: mujoco.MjModel) -> None:
+    model.geom_friction[:, 0] = 0.35
+
+
+def springy(model: mujoco.MjModel) -> None:
+    model.geom_solref[:] = [0.04, 0.3]
+
+
+CASES = {
+    case.kind: case
+    for case in (
+        Case(PENDULUM, "com_offset", {"x": 0.04, "z": -0.02}, shift_com),
+        Case(PENDULUM, "air_drag", {"coefficient": 0.4}, force=drag),
+        Case(PENDULUM, "gravity_tilt", {"pitch": 0.1}, tilt),
+        Case(
+            PENDULUM, "encoder_scale", {"scale": 1.1}, report=lambda states: 1.1 * states,
+        ),
+        Case(
+            PENDULUM, "encoder_offset", {"offset": 0.2}, report=lambda states: states + np.array([0.2, 0.0]),
+        ),
+        Case(PENDULUM, "sensor_delay", {"delay": 0.015}, late=0.015),
+        Case(SLIDER, "contact_friction", {"sliding": 0.35}, slippery, target="geom/ball"),
+        Case(
+            SLIDER, "contact_compliance", {"time_constant": 0.04, "damping_ratio": 0.3}, springy,
+            target="geom/ball", rel=0.1,
+        ),
+    )
+}  # fmt: skip
+
+
+def record(case: Case, seed: int, seconds: float = 4.0) -> Recording:
+    """Step plain MuJoCo, note its state at every fine step, and read it as late as the sensors."""
+    rng = np.random.default_rng(seed)
+    model = spec(case.mjcf).compile()
+    model.opt.timestep /= REFINEMENT
+    case.change(model)
+    data = mujoco.MjData(model)
+    time = np.arange(round(seconds * RATE)) / RATE
+    ctrl = 0.8 * np.sin(9 * time + seed) * np.sign(np.sin(2 * time))
+    if case.mjcf is SLIDER:  # drop it, and push harder than friction holds
+        data.qpos[0], ctrl = 0.36, 4.0 * np.sign(np.sin(8 * time + seed))
+    else:
+        data.qpos[0] = 0.8
+    per_sample = round(1.0 / RATE / model.opt.timestep)
+    path = np.zeros((len(time) * per_sample, model.nq + model.nv))
+    for k in range(len(path)):
+        path[k] = np.concatenate([data.qpos, data.qvel])
+        data.ctrl[:] = ctrl[k // per_sample]
+        case.force(model, data)
+        mujoco.mj_step(model, data)
+    rows = np.arange(len(time)) * per_sample - round(case.late / model.opt.timestep)
+    states = case.report(path[np.maximum(rows, 0)])
+    states = states + rng.normal(size=states.shape) * np.repeat([1e-4, 1e-3], model.nv)
+    kept = slice(10, None)  # what precedes the recording moved, too
+    return Recording(
+        name=f"made {seed}",
+        time=time[kept] - time[10],
+        qpos=states[kept, : model.nq],
+        qvel=states[kept, model.nq :],
+        ctrl=ctrl[kept, None],
+        torque={},
+        velocity_measured=True,
+        spans=((0, len(time) - 10),),
+        warnings=(),
+    )
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_the_parameters_are_recovered(kind):
+    case = CASES[kind]
+    model = Model("model", Path(__file__), Path(__file__), spec(case.mjcf))
+    host = model.compile(engine="mujoco").host.model
+    chosen = [
+        effect
+        for effect in make_candidates(model, host)
+        if effect.kind == kind and effect.target == (case.target or effect.target)
+    ]
+    assert len(chosen) == 1
+    recordings = [record(case, seed) for seed in range(2)]
+    grid = choose_grid(recordings, host.opt.timestep)
+    segments = cut(recordings, grid, 0.5)
+    simulator = Simulator(model, chosen, grid)
+    everything = np.ones(len(segments.start), bool)
+    problem = Problem(simulator, simulator, segments, everything, grid.interval)
+    names = [slot.parameter.name for slot in simulator.slots]
+    free = [names.index(name) for name in case.truth]
+    found = fit(problem, simulator.base, segments.start, free)
+    estimates = dict(zip(case.truth, found.theta[free], strict=True))
+    assert estimates == pytest.approx(dict(case.truth), rel=case.rel)
