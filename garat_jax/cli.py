@@ -4,26 +4,21 @@ Each command is a frozen dataclass: its docstrings are the help, its `run` does 
 anything that loads JAX stand inside `run`, so that help and errors come at once.
 """
 
-import contextlib
 import dataclasses
 import inspect
-import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
-from rich.console import Console
-from rich.table import Table
 from tyro.conf import Positional, arg
 
 from garat_jax import __version__
 from garat_jax.commandline import PROGRAM, how_to_go_on, parse
+from garat_jax.commands.console import complain, make_run, print_table, say
+from garat_jax.commands.diagnosis import Compare, Diagnose
+from garat_jax.commands.models import Add, Convert, Effects, Export
 from garat_jax.errors import DivergedError, UserError, choose
-
-if TYPE_CHECKING:
-    from garat_jax.effects import Effect
-    from garat_jax.runs import RunDirectory
 
 DESCRIPTION = "Ground a simulator in data, and find the physical effect that it is missing."
 
@@ -107,86 +102,6 @@ class Transfer:
 
 
 @dataclasses.dataclass(frozen=True)
-class Compare:
-    """Measure the error of a model as it is, by signal and horizon."""
-
-    model: Annotated[Positional[Path], arg(metavar="MODEL")]
-    """MJCF (.xml) or model card (.toml)."""
-    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA...")]
-    """Recordings (CSV, Parquet or NPZ), one a file."""
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for compare.json and report.html; runs/compare-MODEL by default."""
-    force: bool = False
-    """Replace an earlier run in DIR."""
-
-    def run(self) -> None:
-        """Compare the model with the recordings."""
-        check_files([self.model], "MODEL")
-        check_files(self.data, "DATA")
-        from garat_jax.diagnosis import run_compare
-
-        out = self.out or Path("runs") / f"compare-{self.model.stem}"
-        with make_run(self, out) as run:
-            run_compare(self.model, self.data, run)
-        say(f"report: {run.root / 'report.html'}")
-
-
-@dataclasses.dataclass(frozen=True)
-class Diagnose:
-    """Find where a model fails and which physical effect it is missing."""
-
-    model: Annotated[Positional[Path], arg(metavar="MODEL")]
-    """MJCF (.xml) or model card (.toml)."""
-    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA...")]
-    """Recordings (CSV, Parquet or NPZ), one a file."""
-    holdout: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
-    """Recordings to prove the result on; by default some of DATA are held out."""
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for diagnosis.json and report.html; runs/diagnose-MODEL by default."""
-    force: bool = False
-    """Replace an earlier run in DIR."""
-
-    def run(self) -> None:
-        """Diagnose the model."""
-        check_files([self.model], "MODEL")
-        check_files(self.data, "DATA")
-        check_files(self.holdout or self.data, "--holdout")
-        from garat_jax.diagnosis import run_diagnose
-
-        out = self.out or Path("runs") / f"diagnose-{self.model.stem}"
-        with make_run(self, out) as run:
-            run_diagnose(self.model, self.data, self.holdout, run)
-        say(f"report: {run.root / 'report.html'}")
-
-
-@dataclasses.dataclass(frozen=True)
-class Effects:
-    """Print the catalogue of physical effects: law, parameters, units, what identifies them."""
-
-    effect: Annotated[Positional[str | None], arg(metavar="EFFECT")] = None
-    """Print all there is to know about one effect."""
-
-    def run(self) -> None:
-        """Print the catalogue, or one entry."""
-        from garat_jax.effects import CATALOGUE
-
-        if self.effect is not None:
-            print_effect(choose("effect", self.effect, CATALOGUE))
-            return
-        rows = [
-            (
-                kind,
-                ", ".join(effect.elements),
-                effect.law,
-                ", ".join(f"{p.name} [{p.unit}]" for p in effect.parameters()),
-                effect.identified_by,
-            )
-            for kind, effect in CATALOGUE.items()
-        ]
-        print_table(("effect", "acts on", "law", "parameters", "identified by"), rows)
-
-
-@dataclasses.dataclass(frozen=True)
 class List:
     """Print the environments, pairs and methods that there are."""
 
@@ -206,6 +121,9 @@ COMMANDS: dict[str, type[Command]] = {
     "transfer": Transfer,
     "compare": Compare,
     "diagnose": Diagnose,
+    "add": Add,
+    "export": Export,
+    "convert": Convert,
     "effects": Effects,
     "list": List,
 }
@@ -234,80 +152,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         return complain(f"error: {error}", USER_ERROR)
     return DONE
-
-
-def complain(message: str, status: int) -> int:
-    """Print one line on stderr and return the exit status that goes with it."""
-    line = " ".join(message.split())
-    sys.stderr.write(f"{PROGRAM}: {line}\n")
-    return status
-
-
-def say(message: str) -> None:
-    """Print one line on stdout, as it is."""
-    Console(soft_wrap=True, highlight=False, markup=False).print(message)
-
-
-@contextlib.contextmanager
-def make_run(
-    command: Any, out: Path, seeds: Sequence[int] = (), resume: bool | None = None
-) -> Iterator["RunDirectory"]:
-    """Make the run directory of a command; the command's fields are the run's config.
-
-    Wrong input that shows only within the block leaves no empty run behind.
-
-    Args:
-        command: A command with a field `force`.
-        out: The folder.
-        seeds: The seeds of the run.
-        resume: Go on with the run that the folder holds; None if the command cannot.
-    """
-    from garat_jax.runs import RunDirectory
-
-    config = {
-        field.name: getattr(command, field.name)
-        for field in dataclasses.fields(command)
-        if field.name not in ("out", "force", "resume")
-    }
-    line = shlex.join([PROGRAM, *sys.argv[1:]])
-    run = RunDirectory.create(out, config, line, seeds, force=command.force, resume=resume)
-    if run.resumed and (changed := run.changed_versions()):
-        complain(f"warning: the run was begun with other versions: {', '.join(changed)}", DONE)
-    try:
-        yield run
-    except UserError:
-        run.discard()
-        raise
-
-
-def check_files(paths: Sequence[Path], what: str) -> None:
-    """Refuse an empty list of files and files that are not there."""
-    if not paths:
-        raise UserError(f"{what}: expected one file or more")
-    for path in paths:
-        if not path.is_file():
-            raise UserError(f"{what}: there is no file {path}")
-
-
-def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table, as wide as the terminal or, where there is none, as its content."""
-    table = Table(*columns)
-    for row in rows:
-        table.add_row(*row)
-    console = Console()
-    width = console.width if console.is_terminal else max(console.width, 160)
-    Console(width=width, markup=False).print(table)
-
-
-def print_effect(effect: "type[Effect]") -> None:
-    """Print what an effect does, and its parameters with units, bounds and their source."""
-    say(f"{effect.kind}: {effect.law}\n\n{inspect.getdoc(effect)}\n")
-    say(f"Acts on: {', '.join(effect.elements)}. Identified by: {effect.identified_by}.")
-    rows = [
-        (p.name, p.unit, f"{p.nominal:g}", f"{p.low:g} to {p.high:g}", p.source)
-        for p in effect.parameters()
-    ]
-    print_table(("parameter", "unit", "no effect", "bounds", "source of the bounds"), rows)
 
 
 def first_line(entry: Any) -> str:

@@ -60,7 +60,7 @@ def test_version():
     [
         ([], ["no command", "demo, transfer"]),
         (["transfr", "x"], ["unknown command 'transfr'", "did you mean transfer?"]),
-        (["qqqq"], ["unknown command 'qqqq'", "known: compare, demo"]),
+        (["qqqq"], ["unknown command 'qqqq'", "known: add, compare"]),
         (["--verison"], ["unknown option '--verison'", "--version"]),
         (["transfer", "x", "--sedes", "2"], ["'--sedes'", "did you mean --seeds"]),
         (["transfer", "x", "--sedes=2"], ["'--sedes'", "did you mean --seeds"]),

@@ -12,6 +12,7 @@ import numpy as np
 from garat_jax.diagnosis.diagnose import choose_horizon, thin
 from garat_jax.diagnosis.fit import Problem, settle
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
+from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.diagnosis.rank import ABOVE_FLOOR, Floor, make_metric, noise_floor
@@ -19,6 +20,8 @@ from garat_jax.diagnosis.replay import Replay, Size, replay_with
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.simulate import Simulator, choose_grid
 from garat_jax.dynamics import native_model
+from garat_jax.effects import CATALOGUE
+from garat_jax.effects.catalogue import Catalogue
 from garat_jax.provenance import versions
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
 
@@ -107,26 +110,41 @@ def compare(
     )
 
 
-def run_compare(model: Path, data: Sequence[Path], run: RunDirectory) -> Comparison:
+def run_compare(
+    model: Path,
+    data: Sequence[Path],
+    run: RunDirectory,
+    columns: Path | None = None,
+    catalogue: Catalogue = CATALOGUE,
+) -> Comparison:
     """Compare a model file with recordings; write compare.json and report.html into a run.
+
+    Args:
+        model: MJCF or model card.
+        data: Recordings.
+        run: Where to write.
+        columns: Map of the recordings' columns.
+        catalogue: The kinds of effect that there are.
 
     Raises:
         UserError: A file cannot be read or does not fit the model.
     """
     from garat_jax.diagnosis.report import write_comparison
 
-    loaded = load_model(model)
-    recordings = read_recordings(loaded, data)
+    loaded = load_model(model, catalogue)
+    recordings = read_recordings(loaded, data, columns)
     comparison = compare(loaded, recordings, tell)
     run.write_json("compare.json", comparison.to_json())
     write_comparison(run, comparison, loaded, recordings)
     return comparison
 
 
-def read_recordings(model: Model, paths: Sequence[Path]) -> list[Recording]:
-    """Read recordings of a model and tell their warnings."""
-    host = native_model(model.compile(engine="mujoco"))
-    recordings = [Recording.read(path, host) for path in paths]
+def read_recordings(
+    model: Model, paths: Sequence[Path], columns: Path | None = None
+) -> list[Recording]:
+    """Read recordings of a model, their columns as a map file says, and tell their warnings."""
+    column_map = read_map(columns) if columns else None
+    recordings = [Recording.read(path, model, column_map) for path in paths]
     for recording in recordings:
         for warning in recording.warnings:
             tell(f"warning: {warning}")

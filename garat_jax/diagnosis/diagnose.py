@@ -23,7 +23,7 @@ from garat_jax.diagnosis.simulate import (
     nearby_starts,
 )
 from garat_jax.dynamics import native_model
-from garat_jax.effects import CATALOGUE, Effect
+from garat_jax.effects import Effect
 from garat_jax.provenance import versions
 
 HORIZONS = (2.0, 1.0, 0.5, 0.3, 0.2)
@@ -127,7 +127,7 @@ def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
     """
     present = {(effect.kind, effect.target) for effect in model.effects}
     candidates = []
-    for kind, cls in CATALOGUE.items():
+    for kind, cls in model.catalogue.items():
         for target in cls.targets(host):
             alone = target == "all" and "actuator" in cls.elements and host.nu < 2
             if alone or (kind, target) in present:

@@ -274,6 +274,8 @@ def _abscissa(missing: MissingTorque, field: str, dof: int, unit: str) -> np.nda
 
 def _binned(x: np.ndarray, y: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean of x and y in each bin that holds a few samples."""
+    if len(edges) < 2:  # x is constant
+        return np.zeros(0), np.zeros(0)
     index = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
     counts = np.bincount(index, minlength=len(edges) - 1)
     full = counts > 4

@@ -15,7 +15,10 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.filters import local_slope, white_noise
+from garat_jax.diagnosis.maps import ColumnMap
+from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.tables import Table, read_table
+from garat_jax.dynamics import native_model
 from garat_jax.effects.base import DOFS_OF_JOINT, element_names
 from garat_jax.errors import UserError, nearest, unknown_name
 
@@ -63,18 +66,26 @@ class Recording:
     warnings: tuple[str, ...]
 
     @classmethod
-    def read(cls, path: str | Path, model: mujoco.MjModel) -> "Recording":
+    def read(
+        cls,
+        path: str | Path,
+        model: Model | mujoco.MjModel,
+        column_map: ColumnMap | None = None,
+    ) -> "Recording":
         """Read and check a recording of a model.
 
         Args:
             path: CSV, Parquet or NPZ file.
             model: The model, which names the columns.
+            column_map: How the file names its columns, and in which units; see `maps.read_map`.
 
         Raises:
             UserError: The file cannot be read or does not fit the model; one line says where and
                 how to mend it.
         """
-        table = read_table(path)
+        if isinstance(model, Model):
+            model = native_model(model.compile(engine="mujoco"))
+        table = _read(path, model, column_map)
         velocity_measured = _check_columns(table, model)
         _check_values(table)
         columns = table.columns
@@ -102,6 +113,24 @@ class Recording:
         return dataclasses.replace(
             recording, warnings=(*warnings, *_oddities(table.path, recording, model))
         )
+
+
+def _read(path: str | Path, model: mujoco.MjModel, column_map: ColumnMap | None) -> Table:
+    if column_map is None:
+        return read_table(path)
+    column_map.check({"time": "s", **{s.name: s.unit for s in (*signals(model), *torques(model))}})
+    raw = read_table(path, column_map.sources)
+    return Table(raw.path, column_map.apply(raw.columns))
+
+
+def torques(model: mujoco.MjModel) -> tuple[Signal, ...]:
+    """List the torques that may be measured, by joint."""
+    slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
+    kinds = [int(kind) for kind in model.jnt_type]
+    return tuple(
+        Signal(f"torque.{name}", "N" if kind == slide else "N m")
+        for name, kind in zip(_joints(model), kinds, strict=True)
+    )
 
 
 def signals(model: mujoco.MjModel) -> tuple[Signal, ...]:
@@ -188,8 +217,8 @@ def _check_columns(table: Table, model: mujoco.MjModel) -> bool:
     names = [s.name for s in signals(model)]
     positions, velocities = names[: model.nq], names[model.nq :]
     commands = ["ctrl." + name for name in _actuators(model)]
-    torques = ["torque." + name for name in _joints(model)]
-    known = ["time", *positions, *velocities, *commands, *torques]
+    known = ["time", *positions, *velocities, *commands, *(s.name for s in torques(model))]
+    _check_actuators(table, commands)
     for name in table.columns:
         if name not in known:
             raise UserError(f"{table.path}: {unknown_name('column', name, known)}")
@@ -198,6 +227,18 @@ def _check_columns(table: Table, model: mujoco.MjModel) -> bool:
         if name not in table.columns:
             raise _missing(table, name)
     return measured
+
+
+def _check_actuators(table: Table, commands: list[str]) -> None:
+    """Where commands and actuators do not match, list both sides."""
+    there = [name for name in table.columns if name.startswith("ctrl.")]
+    if set(there) == set(commands) or len(set(there) ^ set(commands)) == 1:
+        return
+    raise UserError(
+        f"{table.path}: its commands are {', '.join(there) or 'none'}, and the model's actuators "
+        f"want {', '.join(commands) or 'none'}; rename the columns (see --map) or use the model "
+        "that was recorded"
+    )
 
 
 def _missing(table: Table, name: str) -> UserError:

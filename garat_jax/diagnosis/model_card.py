@@ -16,6 +16,7 @@ import numpy as np
 
 from garat_jax.dynamics import Dynamics, Override, compile, load_spec
 from garat_jax.effects import CATALOGUE, Effect
+from garat_jax.effects.catalogue import Catalogue
 from garat_jax.errors import UserError, choose, unknown_name
 
 FORMAT = "garat-model/1"
@@ -35,6 +36,7 @@ class Model:
         spec: MuJoCo's editable model.
         overrides: Changes of the model before it is compiled.
         effects: Physical effects added to it.
+        catalogue: The kinds of effect that a diagnosis may find missing in it.
     """
 
     name: str
@@ -43,21 +45,26 @@ class Model:
     spec: mujoco.MjSpec
     overrides: tuple[Override, ...] = ()
     effects: tuple[Effect, ...] = ()
+    catalogue: Catalogue = dataclasses.field(default_factory=lambda: CATALOGUE)
 
     def compile(self, engine: str = "auto", extra_effects: Sequence[Effect] = ()) -> Dynamics:
         """Compile the model, with more effects after its own; see `dynamics.compile`."""
         return compile(self.spec, self.overrides, (*self.effects, *extra_effects), engine)
 
 
-def load_model(path: str | Path) -> Model:
+def load_model(path: str | Path, catalogue: Catalogue = CATALOGUE) -> Model:
     """Read an MJCF file (.xml) or a model card (.toml).
+
+    Args:
+        path: The file.
+        catalogue: The kinds of effect that there are; `load_catalogue` adds a user's own.
 
     Raises:
         UserError: The file cannot be read, or the card names something that does not exist.
     """
     path = Path(path)
     if path.suffix.lower() == ".xml":
-        return Model(path.stem, path, path, load_spec(path))
+        return Model(path.stem, path, path, load_spec(path), catalogue=catalogue)
     if path.suffix.lower() != ".toml":
         raise UserError(f"{path}: expected an MJCF file (.xml) or a model card (.toml)")
     card = _read_toml(path)
@@ -65,13 +72,13 @@ def load_model(path: str | Path) -> Model:
     spec = load_spec(mjcf)
     try:
         overrides = tuple(_override(table) for table in _tables(card, "override"))
-        effects = tuple(_effect(table) for table in _tables(card, "effect"))
+        effects = tuple(_effect(table, catalogue) for table in _tables(card, "effect"))
         host = compile(spec, overrides, engine="mujoco").host.model
         for effect in effects:
             effect.check(host)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    return Model(path.stem, path, mjcf, spec, overrides, effects)
+    return Model(path.stem, path, mjcf, spec, overrides, effects, catalogue)
 
 
 def save_card(path: str | Path, model: Model, extra_effects: Sequence[Effect] = ()) -> Path:
@@ -89,15 +96,8 @@ def save_card(path: str | Path, model: Model, extra_effects: Sequence[Effect] = 
         UserError: The card would lie outside the folder of the model's MJCF, or is no .toml file.
     """
     path = Path(path)
-    if path.suffix.lower() != ".toml":
-        raise UserError(f"{path}: a model card's name ends in .toml")
-    folder, mjcf = path.parent.resolve(), model.mjcf.resolve()
-    if not mjcf.is_relative_to(folder):
-        raise UserError(
-            f"{path}: a card may not leave its folder, and {model.mjcf} is not in it; "
-            f"write the card to {model.mjcf.parent} or copy the model first"
-        )
-    lines = [f"format = {_toml(FORMAT)}", f"mjcf = {_toml(mjcf.relative_to(folder).as_posix())}"]
+    mjcf = mjcf_in_card(path, model)
+    lines = [f"format = {_toml(FORMAT)}", f"mjcf = {_toml(mjcf)}"]
     for override in model.overrides:
         lines += ["", "[[override]]"]
         lines += [f"{key} = {_toml(getattr(override, key))}" for key in OVERRIDE_KEYS]
@@ -107,6 +107,23 @@ def save_card(path: str | Path, model: Model, extra_effects: Sequence[Effect] = 
         lines += [f"target = {_toml(effect.target)}", f"parameters = {{ {', '.join(values)} }}"]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
+
+
+def mjcf_in_card(path: Path, model: Model) -> str:
+    """Return how a card at `path` would name the model's MJCF.
+
+    Raises:
+        UserError: The card would lie outside the folder of the model's MJCF, or is no .toml file.
+    """
+    if path.suffix.lower() != ".toml":
+        raise UserError(f"{path}: a model card's name ends in .toml")
+    folder, mjcf = path.parent.resolve(), model.mjcf.resolve()
+    if not mjcf.is_relative_to(folder):
+        raise UserError(
+            f"{path}: a card may not leave its folder, and {model.mjcf} is not in it; "
+            f"write the card to {model.mjcf.parent} or copy the model first"
+        )
+    return mjcf.relative_to(folder).as_posix()
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -164,18 +181,26 @@ def _override(table: dict[str, Any]) -> Override:
     return Override(**table)
 
 
-def _effect(table: dict[str, Any]) -> Effect:
+def _effect(table: dict[str, Any], catalogue: Catalogue) -> Effect:
     _check_keys(table, "effect", EFFECT_KEYS)
     kind, target, parameters = (table[key] for key in EFFECT_KEYS)
     if not isinstance(kind, str) or not isinstance(target, str) or not isinstance(parameters, dict):
         raise UserError("[[effect]] needs names for kind and target and a table of parameters")
-    cls = choose("effect", kind, CATALOGUE)
+    return make_effect(choose("effect", kind, catalogue), target, parameters)
+
+
+def make_effect(cls: type[Effect], target: str, parameters: Mapping[str, Any]) -> Effect:
+    """Make an effect from the numbers that a user gave.
+
+    Raises:
+        UserError: A parameter is unknown or no finite number.
+    """
     known = [parameter.name for parameter in cls.parameters()]
     for name, value in parameters.items():
         if name not in known:
-            raise unknown_name(f"parameter of {kind}", name, known)
+            raise unknown_name(f"parameter of {cls.kind}", name, known)
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise UserError(f"{kind} {name} = {value!r}; expected a finite number")
+            raise UserError(f"{cls.kind} {name} = {value!r}; expected a finite number")
     return cls(target=target, **{name: float(value) for name, value in parameters.items()})
 
 

@@ -16,7 +16,6 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Estimate
 from garat_jax.diagnosis.view import View, look
-from garat_jax.effects import CATALOGUE
 from garat_jax.report import Fact, Figure, Reproduce, Section, Table
 from garat_jax.runs import RunDirectory
 
@@ -107,7 +106,7 @@ def diagnosis_sections(
         *_where(diagnosis.where, view),
         *_ranking(diagnosis),
         *_ladder(diagnosis),
-        *_parameters(diagnosis),
+        *_parameters(diagnosis, model),
         *_next(diagnosis),
     ]
 
@@ -318,7 +317,7 @@ def _ladder(diagnosis: Diagnosis) -> list[Section]:
     return [Section("The error falls", text, figures=[Figure(figures.ladder(diagnosis), caption)])]
 
 
-def _parameters(diagnosis: Diagnosis) -> list[Section]:
+def _parameters(diagnosis: Diagnosis, model: Model) -> list[Section]:
     if not diagnosis.selected:
         return []
     rows = [
@@ -326,7 +325,9 @@ def _parameters(diagnosis: Diagnosis) -> list[Section]:
         for c in diagnosis.selected
         for name, e in c.parameters.items()
     ]
-    laws = "\n".join(f"- {words(c.effect)}: {CATALOGUE[c.effect].law}" for c in diagnosis.selected)
+    laws = "\n".join(
+        f"- {words(c.effect)}: {model.catalogue[c.effect].law}" for c in diagnosis.selected
+    )
     columns = ["effect", "parameter", "estimate", "low", "high", "unit"]
     caption = "Estimates and their 95 % intervals; – where the recordings say nothing."
     return [Section("What was added", laws, tables=[Table(columns, rows, caption)])]

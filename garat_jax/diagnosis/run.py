@@ -11,6 +11,8 @@ from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.model_card import load_model
 from garat_jax.diagnosis.report import diagnosis_sections, write_diagnosis
 from garat_jax.diagnosis.results import Diagnosis
+from garat_jax.effects import CATALOGUE
+from garat_jax.effects.catalogue import Catalogue
 from garat_jax.report import Section
 from garat_jax.runs import RunDirectory
 
@@ -23,7 +25,12 @@ class Diagnosed(NamedTuple):
 
 
 def run_diagnose(
-    model: Path, data: Sequence[Path], holdout: Sequence[Path], run: RunDirectory
+    model: Path,
+    data: Sequence[Path],
+    holdout: Sequence[Path],
+    run: RunDirectory,
+    columns: Path | None = None,
+    catalogue: Catalogue = CATALOGUE,
 ) -> Diagnosed:
     """Diagnose a model file with recordings; write diagnosis.json and report.html into a run.
 
@@ -32,12 +39,14 @@ def run_diagnose(
         data: Recordings to find the missing effects with.
         holdout: Recordings to prove them on; some of `data` are held out if there are none.
         run: Where to write.
+        columns: Map of the recordings' columns.
+        catalogue: The kinds of effect that may be missing.
 
     Raises:
         UserError: A file cannot be read or does not fit the model.
     """
-    loaded = load_model(model)
-    recordings, held_out = read_recordings(loaded, data), read_recordings(loaded, holdout)
+    loaded = load_model(model, catalogue)
+    recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
     with Console(stderr=True).status("reading the recordings") as status:
         diagnosis = diagnose(loaded, recordings, held_out, status.update)
         run.write_json("diagnosis.json", diagnosis.to_json())

@@ -2,15 +2,18 @@
 
 import csv
 import zipfile
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from garat_jax.errors import UserError
+from garat_jax.errors import UserError, unknown_name
 
 ROWS_NAMED = 5
 """How many bad rows a message names."""
+SEPARATORS = (",", ";", "\t")
+"""Of a foreign CSV file: the one that its first line has most of."""
 
 
 class Table:
@@ -47,8 +50,13 @@ class Table:
         return f"{word}{'s' if len(indices) > 1 else ''} {named}{more}"
 
 
-def read_table(path: str | Path) -> Table:
+def read_table(path: str | Path, wanted: Collection[str] | None = None) -> Table:
     """Read the columns of a CSV, Parquet or NPZ file.
+
+    Args:
+        path: The file.
+        wanted: Leave out all other columns of a foreign file, whose separator may then be a
+            semicolon or a tab too; None reads every column.
 
     Raises:
         UserError: The file is missing, empty, of another kind, damaged, or holds anything but
@@ -65,7 +73,7 @@ def read_table(path: str | Path) -> Table:
             f"{path}: unknown kind of file {path.suffix!r}; expected {', '.join(_READERS)}"
         )
     try:
-        return Table(path, reader(path))
+        return Table(path, reader(path, wanted))
     except UserError:
         raise
     except (OSError, ValueError, zipfile.BadZipFile) as error:
@@ -73,9 +81,13 @@ def read_table(path: str | Path) -> Table:
         raise UserError(f"{path}: cannot be read as {path.suffix[1:].upper()}: {detail}") from error
 
 
-def _read_csv(path: Path) -> dict[str, np.ndarray]:
+def _read_csv(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
+    separator = ","
     with path.open(newline="", encoding="utf-8-sig") as file:
-        header = [name.strip() for name in next(csv.reader(file), [])]
+        first = file.readline()
+    if wanted is not None:
+        separator = max(SEPARATORS, key=first.count)
+    header = [name.strip() for name in next(csv.reader([first], delimiter=separator), [])]
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
         mark = "';'" if ";" in header[0] else "tabs"
         raise UserError(f"{path}: columns are separated by {mark}; expected commas")
@@ -96,35 +108,67 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         encoding="utf-8-sig",
         on_bad_lines="error",
         low_memory=False,
+        sep=separator,
     )
     filled = np.flatnonzero(frame.notna().any(axis=1))
-    return _numbers(path, frame.iloc[: filled[-1] + 1 if len(filled) else 0])
+    return _numbers(path, _only(path, frame.iloc[: filled[-1] + 1 if len(filled) else 0], wanted))
 
 
-def _read_parquet(path: Path) -> dict[str, np.ndarray]:
-    return _numbers(path, pd.read_parquet(path))
+def _read_parquet(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
+    return _numbers(path, _only(path, pd.read_parquet(path), wanted))
 
 
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
+def _only(path: Path, frame: pd.DataFrame, wanted: Collection[str] | None) -> pd.DataFrame:
+    """Leave out columns that nobody wants."""
+    if wanted is None:
+        return frame
+    check_wanted(path, wanted, list(map(str, frame.columns)))
+    return frame.drop(columns=[name for name in frame.columns if name not in wanted])
+
+
+def check_wanted(path: Path, wanted: Collection[str], there: Collection[str]) -> None:
+    """Refuse a file that lacks a column that a map file asks for.
+
+    Raises:
+        UserError: It does; the message has the nearest names.
+    """
+    for name in wanted:
+        if name not in there:
+            raise UserError(f"{path}: {unknown_name('column', name, there)}")
+
+
+def _read_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise UserError(f"{path}: not an NPZ archive; write it with numpy.savez")
     columns = {}
     with np.load(path, allow_pickle=False) as archive:
-        for name in archive.files:
-            try:
-                values = archive[name]
-            except ValueError as error:
+        check_wanted(path, wanted or (), archive.files)
+        for name in archive.files if wanted is None else dict.fromkeys(wanted):
+            columns[name] = numbers_of(path, archive, name)
+            if columns[name].ndim != 1:
                 raise UserError(
-                    f"{path}: array {name!r} holds pickled Python objects, which are never loaded; "
-                    "save it as plain numbers"
-                ) from error
-            if values.ndim != 1 or values.dtype.kind not in "fiu":
-                raise UserError(
-                    f"{path}: array {name!r} has shape {values.shape} and type {values.dtype}; "
+                    f"{path}: array {name!r} has shape {columns[name].shape}; "
                     "expected one number a sample"
                 )
-            columns[name] = values.astype(float)
     return columns
+
+
+def numbers_of(path: Path, archive: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """Return an array of an NPZ archive; what is pickled stays unread.
+
+    Raises:
+        UserError: It holds something else than plain numbers.
+    """
+    try:
+        values = archive[name]
+    except ValueError as error:
+        raise UserError(
+            f"{path}: array {name!r} holds pickled Python objects, which are never loaded; "
+            "save it as plain numbers"
+        ) from error
+    if values.dtype.kind not in "fiub":
+        raise UserError(f"{path}: array {name!r} is of type {values.dtype}; expected numbers")
+    return values.astype(float)
 
 
 _READERS = {".csv": _read_csv, ".parquet": _read_parquet, ".npz": _read_npz}

@@ -12,7 +12,6 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
 from garat_jax.diagnosis.results import Candidate
 from garat_jax.dynamics import native_model
-from garat_jax.effects import CATALOGUE
 
 HORIZONS = (0.2, 0.5, 1.0, 2.0)
 """Seconds over which errors are drawn."""
@@ -48,7 +47,9 @@ class View:
 def repaired(model: Model, selected: Sequence[Candidate]) -> Model:
     """Return a model with the effects that a diagnosis found."""
     effects = tuple(
-        CATALOGUE[c.effect](target=c.target, **{n: e.estimate for n, e in c.parameters.items()})
+        model.catalogue[c.effect](
+            target=c.target, **{n: e.estimate for n, e in c.parameters.items()}
+        )
         for c in selected
     )
     return dataclasses.replace(model, effects=(*model.effects, *effects))

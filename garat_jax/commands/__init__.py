@@ -1,0 +1,1 @@
+"""The commands of `garat` about models and measurements: they read arguments and hand over."""

@@ -1,0 +1,101 @@
+"""What commands share: words on the terminal, checks of files, the run directory. No JAX."""
+
+import contextlib
+import dataclasses
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.table import Table
+
+from garat_jax.commandline import PROGRAM
+from garat_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from garat_jax.runs import RunDirectory
+
+
+def complain(message: str, status: int) -> int:
+    """Print one line on stderr and return the exit status that goes with it."""
+    line = " ".join(message.split())
+    sys.stderr.write(f"{PROGRAM}: {line}\n")
+    return status
+
+
+def say(message: str) -> None:
+    """Print one line on stdout, as it is."""
+    Console(soft_wrap=True, highlight=False, markup=False).print(message)
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table, as wide as the terminal or, where there is none, as its content."""
+    table = Table(*columns)
+    for row in rows:
+        table.add_row(*row)
+    console = Console()
+    width = console.width if console.is_terminal else max(console.width, 160)
+    Console(width=width, markup=False).print(table)
+
+
+@contextlib.contextmanager
+def make_run(
+    command: Any, out: Path, seeds: Sequence[int] = (), resume: bool | None = None
+) -> Iterator["RunDirectory"]:
+    """Make the run directory of a command; the command's fields are the run's config.
+
+    Wrong input that shows only within the block leaves no empty run behind.
+
+    Args:
+        command: A command with a field `force`.
+        out: The folder.
+        seeds: The seeds of the run.
+        resume: Go on with the run that the folder holds; None if the command cannot.
+    """
+    from garat_jax.runs import RunDirectory
+
+    config = {
+        field.name: getattr(command, field.name)
+        for field in dataclasses.fields(command)
+        if field.name not in ("out", "force", "resume")
+    }
+    line = shlex.join([PROGRAM, *sys.argv[1:]])
+    run = RunDirectory.create(out, config, line, seeds, force=command.force, resume=resume)
+    if run.resumed and (changed := run.changed_versions()):
+        complain(f"warning: the run was begun with other versions: {', '.join(changed)}", 0)
+    try:
+        yield run
+    except UserError:
+        run.discard()
+        raise
+
+
+def check_files(paths: Sequence[Path], what: str) -> None:
+    """Refuse an empty list of files and files that are not there."""
+    if not paths:
+        raise UserError(f"{what}: expected one file or more")
+    for path in paths:
+        if not path.is_file():
+            raise UserError(f"{what}: there is no file {path}")
+
+
+def check_optional(path: Path | None, option: str) -> None:
+    """Refuse a file that is named and not there."""
+    if path is not None:
+        check_files([path], option)
+
+
+def check_out(path: Path, suffix: str, force: bool) -> None:
+    """Refuse an output file of another kind, and one that is there already without --force."""
+    if path.suffix.lower() != suffix:
+        raise UserError(f"--out {path}: expected a name that ends in {suffix}")
+    if path.is_dir():
+        raise UserError(f"--out {path} is a folder; expected a file")
+    if path.exists() and not force:
+        raise UserError(f"{path} exists already: give --force to replace it, or another --out")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot make the folder {path.parent}: {error.strerror}") from error

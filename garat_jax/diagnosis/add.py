@@ -1,0 +1,149 @@
+"""Give a model one more effect, of a size that the user sets or that recordings tell."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from garat_jax.diagnosis.diagnose import choose_horizon, thin
+from garat_jax.diagnosis.fit import Fit, Problem, fit, settle
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model, make_effect
+from garat_jax.diagnosis.rank import make_metric
+from garat_jax.diagnosis.results import Estimate
+from garat_jax.diagnosis.simulate import Simulator, choose_grid
+from garat_jax.effects import Effect, unit_at
+from garat_jax.errors import UserError, choose
+
+
+class Sized(NamedTuple):
+    """An effect whose parameters were fitted.
+
+    Attributes:
+        effect: With the fitted parameters.
+        parameters: Estimates by name; the ends are not finite where the recordings say nothing.
+        horizon: Seconds of the segments whose prediction error was fitted.
+        error_before: Error on the recordings, relative to each signal's standard deviation.
+        error_after: The same with the effect.
+    """
+
+    effect: Effect
+    parameters: Mapping[str, Estimate]
+    horizon: float
+    error_before: float
+    error_after: float
+
+    def __str__(self) -> str:
+        sizes = [f"{name} = {said(e)}" for name, e in self.parameters.items()]
+        return "\n".join([f"{self.effect.kind} at {self.effect.target}:", *sizes, self.change])
+
+    @property
+    def change(self) -> str:
+        """What adding the effect changes on the recordings that it was fitted to."""
+        return (
+            f"error over {self.horizon:g} s on these recordings, of the signals' spread: "
+            f"{self.error_before:.3g} → {self.error_after:.3g}"
+        )
+
+
+def said(estimate: Estimate) -> str:
+    """Return an estimate with its interval and unit as a user reads them."""
+    unit = f" {estimate.unit}" if estimate.unit not in ("", "1") else ""
+    if not np.isfinite([estimate.low, estimate.high]).all():
+        return f"{estimate.estimate:.4g}{unit} (the recordings do not tell it)"
+    return f"{estimate.estimate:.4g}{unit} (95 %: {estimate.low:.4g} to {estimate.high:.4g})"
+
+
+def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, float]) -> Effect:
+    """Make an effect of the model's catalogue, checked against the model and its bounds.
+
+    Raises:
+        UserError: The kind, the target or a parameter is unknown, a value is outside its bounds, or
+            the model has this effect already.
+    """
+    cls = choose("effect", kind, model.catalogue)
+    effect = make_effect(cls, target, values)
+    host = model.compile(engine="mujoco").host.model
+    effect.check(host)
+    for p in cls.parameters():
+        if p.name in values and not p.low <= values[p.name] <= p.high:
+            unit = unit_at(p, host, target)
+            raise UserError(
+                f"{kind} {p.name} = {values[p.name]:g} is outside its bounds, {p.low:g} to "
+                f"{p.high:g} {unit} ({p.source})"
+            )
+    if (kind, target) in [(e.kind, e.target) for e in model.effects]:
+        raise UserError(f"{model.path} has {kind} at {target} already; change it there")
+    return effect
+
+
+def size(
+    model: Model,
+    effect: Effect,
+    given: Sequence[str],
+    recordings: Sequence[Recording],
+    say: Callable[[str], None] = lambda message: None,
+) -> Sized:
+    """Fit an effect's parameters to recordings.
+
+    Args:
+        model: The model without the effect.
+        effect: The effect; its parameters named in `given` keep their values.
+        given: Parameters that are not fitted.
+        recordings: What was measured.
+        say: Told what is being done.
+
+    Raises:
+        UserError: Nothing is left to fit.
+    """
+    recordings = thin(recordings)
+    grid = choose_grid(recordings, model.compile(engine="mujoco").host.model.opt.timestep)
+    simulator = Simulator(model, (effect,), grid)
+    free = [j for j, slot in enumerate(simulator.slots) if slot.parameter.name not in given]
+    if not free:
+        raise UserError("every parameter is set, so nothing is left to fit; leave one of them out")
+    horizon, segments = choose_horizon(simulator, recordings, grid)
+    problem = Problem(
+        simulator,
+        Simulator(model, (effect,), grid, refine=2),
+        segments,
+        np.ones(len(segments.start), bool),
+        grid.interval * grid.per_sample,
+    )
+    metric = make_metric(dataclasses.replace(problem, fitted=~problem.fitted))
+    before = settle(problem, simulator.base, segments.start)
+    say(f"fitting {effect.kind} at {effect.target}")
+    best = _best_fit(problem, before, effect, given, free)
+    return Sized(
+        effect=simulator.with_parameters([float(v) for v in best.theta])[0],
+        parameters=estimates(problem, best),
+        horizon=horizon,
+        error_before=metric.error(before.residual, problem.fitted),
+        error_after=metric.error(best.residual, problem.fitted),
+    )
+
+
+def estimates(problem: Problem, fitted: Fit) -> dict[str, Estimate]:
+    """Return the estimates of a problem's only effect, by parameter."""
+    simulator = problem.simulator
+    found = {}
+    for place, j in enumerate(fitted.free):
+        slot = simulator.slots[j]
+        unit = unit_at(slot.parameter, simulator.host, simulator.effects[slot.effect].target)
+        ends = float(fitted.low[place]), float(fitted.high[place])
+        found[slot.parameter.name] = Estimate(float(fitted.theta[j]), *ends, unit)
+    return found
+
+
+def _best_fit(problem: Problem, before: Fit, effect: Effect, given, free) -> Fit:
+    """Fit from every size at which the effect should be tried; return the best."""
+    simulator = problem.simulator
+    fits = []
+    for sizes in type(effect).starts(simulator.host, effect.target):
+        theta = before.theta.copy()
+        for j, slot in enumerate(simulator.slots):
+            if slot.parameter.name in sizes and slot.parameter.name not in given:
+                theta[j] = sizes[slot.parameter.name]
+        fits.append(fit(problem, theta, before.start, free))
+    return min(fits, key=lambda fitted: float(fitted.cost.sum()))

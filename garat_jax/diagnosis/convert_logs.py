@@ -1,0 +1,151 @@
+"""The command `garat convert`: a log of another kind becomes a recording, as a map file says."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import io
+
+from garat_jax.diagnosis.bags import Series, is_bag, read_bag
+from garat_jax.diagnosis.convert import write_csv
+from garat_jax.diagnosis.maps import ColumnMap, read_map
+from garat_jax.diagnosis.tables import numbers_of, read_table
+from garat_jax.errors import UserError, unknown_name
+
+TABLES = (".csv", ".parquet")
+KINDS = "a bag (folder, .bag, .mcap, .db3), .csv, .parquet, .npz or .mat"
+_ARRAY = re.compile(r"(?P<name>[^\[\]]+)(\[(?P<column>\d+)\])?")
+
+
+def convert_log(log: Path, map_file: Path, out: Path) -> str:
+    """Turn a log into a CSV recording.
+
+    Time starts at 0. A bag's topics come at times of their own: the samples are then those of
+    `time` (or, without it, of the first column); states are interpolated, commands are held.
+
+    Args:
+        log: The log.
+        map_file: Which of its numbers becomes which column.
+        out: The recording to write.
+
+    Returns:
+        What was written, in one line.
+
+    Raises:
+        UserError: The log or the map cannot be read, or they do not fit each other.
+    """
+    column_map = read_map(map_file)
+    suffix = log.suffix.lower()
+    if is_bag(log):
+        columns = _from_bag(log, column_map)
+    elif suffix in TABLES:
+        columns = column_map.apply(read_table(log, column_map.sources).columns)
+    elif suffix in (".npz", ".mat"):
+        columns = _from_arrays(log, column_map)
+    else:
+        raise UserError(f"{log}: unknown kind of log; expected {KINDS}")
+    if "time" not in columns:
+        raise UserError(f'{map_file}: the samples have no time; add time = "NAME"')
+    columns = {"time": columns["time"] - columns["time"][0], **_without_time(columns)}
+    write_csv(out, columns)
+    seconds, num = float(columns["time"][-1]), len(columns["time"])
+    return f"recording: {out} ({num} samples over {seconds:.4g} s: {', '.join(columns)})"
+
+
+def _without_time(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: column for name, column in columns.items() if name != "time"}
+
+
+def _from_bag(log: Path, column_map: ColumnMap) -> dict[str, np.ndarray]:
+    sources = {name: column.source for name, column in column_map.columns.items()}
+    series = read_bag(log, list(dict.fromkeys(sources.values())), column_map.clock)
+    if "time" in sources:
+        time = column_map.columns["time"].to_si(series[sources["time"]].values)
+        stamps = series[sources["time"]].time
+    else:
+        stamps = time = next(iter(series.values())).time
+    moving = [series[s] for name, s in sources.items() if not name.startswith("ctrl.")]
+    covered = stamps >= max(s.time[0] for s in series.values())
+    covered &= stamps <= min((s.time[-1] for s in moving), default=np.inf)
+    kept = np.concatenate([[True], np.diff(stamps) > 0]) & covered
+    if not kept.any():
+        raise UserError(f"{log}: the topics in {column_map.path} do not overlap in time")
+    columns = {"time": time[kept]}
+    for name, source in sources.items():
+        if name != "time":
+            values = _at(series[source], stamps[kept], held=name.startswith("ctrl."))
+            columns[name] = column_map.columns[name].to_si(values)
+    return columns
+
+
+def _at(series: Series, stamps: np.ndarray, held: bool) -> np.ndarray:
+    """Return a series at other times: the last value where it is held, else interpolated."""
+    if held:
+        return series.values[np.searchsorted(series.time, stamps, side="right") - 1]
+    return np.interp(stamps, series.time, series.values)
+
+
+def _from_arrays(log: Path, column_map: ColumnMap) -> dict[str, np.ndarray]:
+    """Read NPZ and MAT files, whose arrays may have several columns and may be nested."""
+    arrays = _npz(log) if log.suffix.lower() == ".npz" else _mat(log)
+    raw = {}
+    for column in column_map.columns.values():
+        match = _ARRAY.fullmatch(column.source)
+        if match is None or match["name"] not in arrays:
+            name = column.source if match is None else match["name"]
+            raise UserError(f"{log}: {unknown_name('array', name, arrays)}")
+        raw[column.source] = _one_column(log, arrays[match["name"]], column.source, match["column"])
+    lengths = {name: len(values) for name, values in raw.items()}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise UserError(f"{log}: the arrays are not equally long: {listed}")
+    return column_map.apply(raw)
+
+
+def _one_column(log: Path, array: np.ndarray, source: str, column: str | None) -> np.ndarray:
+    array = np.squeeze(array)
+    if array.ndim == 2 and column is not None:
+        array = array if array.shape[0] >= array.shape[1] else array.T  # samples come first
+        if int(column) >= array.shape[1]:
+            raise UserError(f"{log}: {source} is not there; it has {array.shape[1]} columns")
+        return array[:, int(column)]
+    if array.ndim != 1:
+        raise UserError(
+            f"{log}: {source} has shape {array.shape}; name one column, such as {source}[0]"
+        )
+    if column is not None:
+        raise UserError(f"{log}: {source}: the array has one column only; leave [{column}] out")
+    return array
+
+
+def _npz(log: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(log, allow_pickle=False) as archive:
+            return {name: numbers_of(log, archive, name) for name in archive.files}
+    except (OSError, ValueError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"{log}: not an NPZ archive; write it with numpy.savez") from error
+
+
+def _mat(log: Path) -> dict[str, np.ndarray]:
+    """Read a MAT file; fields of structures are named `a.b`."""
+    try:
+        content = io.loadmat(log, simplify_cells=True)
+    except NotImplementedError as error:
+        raise UserError(f"{log}: saved by MATLAB with -v7.3; save it again with -v7") from error
+    except Exception as error:  # what scipy raises on damaged files is not documented
+        raise UserError(f"{log}: cannot be read as MAT: {error}") from error
+    return _flatten({name: value for name, value in content.items() if not name.startswith("__")})
+
+
+def _flatten(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
+    flat: dict[str, np.ndarray] = {}
+    for name, value in content.items():
+        if isinstance(value, dict):
+            flat |= _flatten(value, f"{prefix}{name}.")
+        elif np.asarray(value).dtype.kind in "fiub":
+            flat[prefix + name] = np.asarray(value, float)
+    return flat

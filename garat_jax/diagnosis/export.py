@@ -1,0 +1,86 @@
+"""Write a model card as plain MJCF, and say what MJCF cannot."""
+
+import os
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.errors import UserError
+
+
+class Exported(NamedTuple):
+    """A plain MJCF file.
+
+    Attributes:
+        path: The file.
+        unsaid: What MJCF cannot say, one line each.
+    """
+
+    path: Path
+    unsaid: tuple[str, ...]
+
+
+def export_mjcf(model: Model, path: str | Path) -> Exported:
+    """Write a model with its overrides and effects as one MJCF file.
+
+    Included files become part of it; meshes and textures stay where they are and are named
+    relative to it. MuJoCo writes numbers with six digits.
+
+    Args:
+        model: The model.
+        path: The MJCF file.
+
+    Raises:
+        UserError: MuJoCo cannot compile or read back what was written.
+    """
+    path = Path(path)
+    spec = model.spec.copy()
+    for override in model.overrides:
+        override.apply(spec)
+    unsaid = tuple(filter(None, (effect.export(spec) for effect in model.effects)))
+    _point_at_assets(spec, model.mjcf.parent, path.parent)
+    try:
+        spec.compile()
+        text = spec.to_xml()
+    except ValueError as error:
+        raise UserError(f"MuJoCo cannot compile the model: {error}") from error
+    path.write_text(text, encoding="utf-8")
+    try:
+        mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        path.unlink()
+        raise UserError(
+            f"{path}: MuJoCo cannot read the model back: {' '.join(str(error).split())}"
+        ) from error
+    return Exported(path, unsaid)
+
+
+def copy_model(model: Model, folder: Path) -> Path:
+    """Copy a model's MJCF file and all files that it needs into a folder, and return its path.
+
+    Raises:
+        UserError: The model needs a file outside the folder of its MJCF.
+    """
+    source = model.mjcf.parent.resolve()
+    for name in mujoco.mju_getXMLDependencies(str(model.mjcf)):
+        file = Path(name).resolve()
+        if not file.is_relative_to(source):
+            raise UserError(
+                f"{model.mjcf} needs {file}, outside its folder, so it cannot be copied; "
+                "put it beside the model"
+            )
+        target = folder / file.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, target)
+    return folder / model.mjcf.name
+
+
+def _point_at_assets(spec: mujoco.MjSpec, source: Path, target: Path) -> None:
+    """Name the folders of meshes and textures relative to where the file will lie."""
+    for field in ("meshdir", "texturedir"):
+        folder = (source / (getattr(spec.compiler, field) or ".")).resolve()
+        setattr(spec.compiler, field, Path(os.path.relpath(folder, target.resolve())).as_posix())
+    spec.modelfiledir = str(target.resolve())

@@ -1,0 +1,106 @@
+"""The catalogue with a user's own effects: classes in a Python file or behind an entry point."""
+
+import importlib.metadata
+import importlib.util
+import inspect
+import sys
+import traceback
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+
+from garat_jax.effects import CATALOGUE
+from garat_jax.effects.base import OBJECT_TYPES, Effect
+from garat_jax.errors import UserError
+
+ENTRY_POINTS = "garat_jax.effects"
+"""Group of entry points; each names a subclass of `Effect`."""
+PLACES = (*OBJECT_TYPES, "world", "all")
+Catalogue = Mapping[str, type[Effect]]
+"""Kinds of effect by name."""
+
+
+def load_catalogue(files: Sequence[str | Path] = ()) -> dict[str, type[Effect]]:
+    """Return the built-in kinds, those behind entry points, and those in Python files.
+
+    The files are run: give only those that you trust.
+
+    Raises:
+        UserError: A file fails, holds no effect, or an effect lacks what every effect declares.
+    """
+    catalogue = dict(CATALOGUE)
+    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        origin = f"entry point {entry.name} ({entry.value})"
+        try:
+            found = entry.load()
+        except Exception as error:
+            raise UserError(f"{origin}: {type(error).__name__}: {error}") from error
+        _add(catalogue, [found], origin)
+    for file in files:
+        path = Path(file)
+        classes = _effects_in(_run(path))
+        if not classes:
+            raise UserError(f"{path}: holds no effect; expected a class Mine(Effect) with a kind")
+        _add(catalogue, classes, str(path))
+    return catalogue
+
+
+def _run(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise UserError(f"--effects: there is no file {path}")
+    if path.suffix != ".py":
+        raise UserError(f"--effects {path}: expected a Python file (.py)")
+    name = f"garat_user_effects_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise UserError(f"--effects {path}: Python cannot load it")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up there
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise UserError(f"{path}{_line(path, error)}: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _line(path: Path, error: Exception) -> str:
+    """Return the last line of a file that an error came through, as ` line N`."""
+    if isinstance(error, SyntaxError):
+        return f" line {error.lineno}"
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
+    return f" line {frames[-1].lineno}" if frames else ""
+
+
+def _effects_in(module: ModuleType) -> list[type[Effect]]:
+    members = [member for _, member in inspect.getmembers(module, inspect.isclass)]
+    own = [member for member in members if member.__module__ == module.__name__]
+    return [member for member in own if issubclass(member, Effect)]
+
+
+def _add(catalogue: dict[str, type[Effect]], classes: Iterable[type[Effect]], origin: str) -> None:
+    for cls in classes:
+        _check(cls, origin)
+        if cls.kind in catalogue:
+            raise UserError(f"{origin}: there is an effect {cls.kind!r} already; give it another")
+        catalogue[cls.kind] = cls
+
+
+def _check(cls: type[Effect], origin: str) -> None:
+    """Refuse a class that does not say what every effect says."""
+    if not inspect.isclass(cls) or not issubclass(cls, Effect):
+        raise UserError(f"{origin}: {cls!r} is no subclass of garat_jax.effects.Effect")
+    declared = vars(cls)
+    for name in ("kind", "law", "identified_by"):
+        if not isinstance(declared.get(name), str) or not declared[name]:
+            raise UserError(f'{origin}: {cls.__name__} lacks {name}; write {name} = "..."')
+    elements = declared.get("elements")
+    if not isinstance(elements, tuple) or not elements or not set(elements) <= set(PLACES):
+        raise UserError(
+            f"{origin}: {cls.__name__}.elements is {elements!r}; expected a tuple of "
+            f"{', '.join(PLACES)}"
+        )
+    if "__dataclass_fields__" not in declared:
+        raise UserError(f"{origin}: {cls.__name__} needs the decorator flax.struct.dataclass")
+    if not cls.parameters():
+        raise UserError(f"{origin}: {cls.__name__} has no parameter; declare one by parameter(...)")

@@ -1,0 +1,127 @@
+"""`garat add`: what is set is written, what is fitted is recovered, what cannot be is refused."""
+
+from pathlib import Path
+
+import pytest
+
+from garat_jax import cli
+from garat_jax.diagnosis import load_model
+from garat_jax.diagnosis.hidden import make_recordings
+from tests import models
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("pendulum") / "pendulum.xml"
+    path.write_text(models.PENDULUM)
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(pendulum):
+    made = make_recordings(
+        pendulum,
+        pendulum.parent / "data",
+        3,
+        num_recordings=2,
+        seconds=3.0,
+        rate=125.0,
+        kind="coulomb_friction",
+    )
+    return made, [str(path) for path in (*made.fit, *made.holdout)]
+
+
+def add(pendulum, *arguments) -> tuple[int, Path]:
+    out = pendulum.parent / "new.toml"
+    out.unlink(missing_ok=True)
+    return cli.main(["add", str(pendulum), *arguments, "--out", str(out)]), out
+
+
+def test_set_parameters_are_in_the_card(pendulum):
+    status, out = add(pendulum, "payload_mass", "--at", "body/pole", "--set", "mass=0.2", "z=-0.3")
+    assert status == 0
+    (effect,) = load_model(out).effects
+    assert (effect.kind, effect.target) == ("payload_mass", "body/pole")
+    assert (effect.mass, effect.x, effect.z) == (0.2, 0.0, -0.3)
+
+
+def test_a_fitted_effect_is_recovered_and_said(pendulum, recorded, capsys):
+    made, files = recorded
+    status, out = add(pendulum, "coulomb_friction", "--at", "joint/hinge", "--fit", *files)
+    assert status == 0
+    (effect,) = load_model(out).effects
+    assert effect.torque == pytest.approx(made.parameters["torque"], rel=0.05)
+    printed = capsys.readouterr().out
+    assert f"torque = {effect.torque:.4g} N m (95 %: " in printed
+    before, after = printed.rpartition("spread: ")[2].split()[0:3:2]
+    assert float(after) < 0.3 * float(before)
+
+
+def test_a_second_effect_keeps_the_first(pendulum):
+    _, first = add(pendulum, "viscous_damping", "--at", "joint/hinge", "--set", "coefficient=0.1")
+    second = pendulum.parent / "second.toml"
+    arguments = ["torque_offset", "--at", "joint/hinge", "--set", "torque=-0.2"]
+    assert cli.main(["add", str(first), *arguments, "--out", str(second)]) == 0
+    assert [e.kind for e in load_model(second).effects] == ["viscous_damping", "torque_offset"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["coulomb_fricton", "--at", "joint/hinge", "--set", "torque=1"], "coulomb_friction?"),
+        (["coulomb_friction", "--at", "joint/hing", "--set", "torque=1"], "did you mean hinge?"),
+        (["coulomb_friction", "--at", "hinge", "--set", "torque=1"], "acts on joint/NAME"),
+        (["coulomb_friction", "--at", "joint/hinge", "--set", "torqe=1"], "did you mean torque?"),
+        (["coulomb_friction", "--at", "joint/hinge", "--set", "torque"], "expected NAME=VALUE"),
+        (["coulomb_friction", "--at", "joint/hinge", "--set", "torque=x"], "expected NAME=VALUE"),
+        (["coulomb_friction", "--at", "joint/hinge", "--set", "torque=nan"], "finite number"),
+        (
+            ["coulomb_friction", "--at", "joint/hinge", "--set", "torque=-1"],
+            "torque = -1 is outside its bounds, 0 to 50 N m",
+        ),
+        (["coulomb_friction", "--at", "joint/hinge"], "needs a size: give --set NAME=VALUE"),
+        (["coulomb_friction", "--at", "joint/hinge", "--fit", "no.csv"], "there is no file no.csv"),
+    ],
+)
+def test_refusals(pendulum, capsys, arguments, said):
+    status, out = add(pendulum, *arguments)
+    assert status == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert not out.exists()
+
+
+def test_what_is_there_is_kept_without_force(pendulum, capsys):
+    arguments = ["viscous_damping", "--at", "joint/hinge", "--set", "coefficient=0.1"]
+    _, out = add(pendulum, *arguments)
+    before = out.read_text()
+    again = ["add", str(pendulum), *arguments[:-1], "coefficient=0.2", "--out", str(out)]
+    assert cli.main(again) == 2
+    assert "exists already: give --force to replace it" in capsys.readouterr().err
+    assert out.read_text() == before
+    assert cli.main([*again, "--force"]) == 0
+    assert "0.2" in out.read_text()
+
+
+def test_an_effect_is_not_added_twice(pendulum, capsys):
+    arguments = ["viscous_damping", "--at", "joint/hinge", "--set", "coefficient=0.1"]
+    _, out = add(pendulum, *arguments)
+    assert cli.main(["add", str(out), *arguments, "--out", str(out), "--force"]) == 2
+    assert "has viscous_damping at joint/hinge already" in capsys.readouterr().err
+    assert len(load_model(out).effects) == 1
+
+
+def test_a_card_elsewhere_is_refused_before_the_fit(pendulum, recorded, tmp_path, capsys):
+    arguments = ["coulomb_friction", "--at", "joint/hinge", "--fit", *recorded[1]]
+    out = tmp_path / "new.toml"
+    assert cli.main(["add", str(pendulum), *arguments, "--out", str(out)]) == 2
+    assert "a card may not leave its folder" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_nothing_left_to_fit_is_refused(pendulum, recorded, capsys):
+    arguments = ["coulomb_friction", "--at", "joint/hinge", "--set", "torque=1"]
+    status, out = add(pendulum, *arguments, "--fit", *recorded[1])
+    assert status == 2
+    assert "every parameter is set" in capsys.readouterr().err
+    assert not out.exists()

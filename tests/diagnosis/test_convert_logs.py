@@ -1,0 +1,201 @@
+"""`garat convert`: real logs of every kind become the same recording."""
+
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import io
+
+from garat_jax import cli
+from garat_jax.diagnosis.measurements import Recording
+from tests import models
+
+rosbags = pytest.importorskip("rosbags")
+
+MODEL = models.spec(models.PENDULUM).compile()
+NUM, RATE = 60, 100.0
+STAMPS = np.arange(NUM) / RATE
+ANGLE = 30 * np.sin(3 * STAMPS)
+SPEED = 90 * np.cos(3 * STAMPS)
+EPOCH = 1_700_000_000
+COLUMNS = """
+"qpos.hinge" = {{ from = "{angle}", unit = "deg" }}
+"qvel.hinge" = {{ from = "{speed}", unit = "deg/s" }}
+"ctrl.motor" = "{torque}"
+"""
+OF_ARRAYS = COLUMNS.format(angle="state[0]", speed="state[1]", torque="u")
+OF_BAGS = COLUMNS.format(
+    angle="/joint_states.position[hinge]", speed="/joint_states.velocity[1]", torque="/effort.data"
+)
+
+
+def convert(folder, log, columns, time='time = "t"', head="") -> tuple[int, Recording | None]:
+    path, out = folder / "map.toml", folder / "data.csv"
+    path.write_text(f'format = "garat-map/1"\n{head}\n[column]\n{time}\n{columns}')
+    status = cli.main(["convert", str(log), "--map", str(path), "--out", str(out)])
+    return status, Recording.read(out, MODEL) if status == 0 else None
+
+
+def check(recording, torque=None):
+    np.testing.assert_allclose(recording.time, STAMPS, atol=1e-6)
+    np.testing.assert_allclose(recording.qpos[:, 0], np.radians(ANGLE), atol=1e-6)
+    np.testing.assert_allclose(recording.qvel[:, 0], np.radians(SPEED), atol=1e-6)
+    np.testing.assert_allclose(recording.ctrl[:, 0], STAMPS if torque is None else torque)
+
+
+def arrays():
+    return {"t": STAMPS + 5, "state": np.stack([ANGLE, SPEED]), "u": STAMPS}
+
+
+def test_npz_with_an_array_of_states(tmp_path):
+    np.savez(tmp_path / "log.npz", **arrays())
+    check(convert(tmp_path, tmp_path / "log.npz", OF_ARRAYS)[1])
+
+
+def test_mat_with_a_structure(tmp_path):
+    io.savemat(tmp_path / "log.mat", {"run": {**arrays(), "state": arrays()["state"].T}})
+    columns = OF_ARRAYS.replace("state[", "run.state[").replace('"u"', '"run.u"')
+    check(convert(tmp_path, tmp_path / "log.mat", columns, 'time = "run.t"')[1])
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.parquet"])
+def test_foreign_tables(tmp_path, name, capsys):
+    frame = pd.DataFrame({"t": STAMPS, "a": ANGLE, "s": SPEED, "u": STAMPS, "note": "x"})
+    path = tmp_path / name
+    if name.endswith("csv"):
+        frame.to_csv(path, index=False, sep=";")
+    else:
+        frame.to_parquet(path)
+    columns = COLUMNS.format(angle="a", speed="s", torque="u")
+    check(convert(tmp_path, path, columns)[1])
+    assert f"({NUM} samples over 0.59 s: time, qpos.hinge" in capsys.readouterr().out
+
+
+def stamp(store, seconds):
+    nanoseconds = round(seconds * 1e9)
+    cls = store.types["builtin_interfaces/msg/Time"]
+    return cls(sec=EPOCH + nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
+
+
+def messages(store):
+    """Yield (topic, message type, recorded nanoseconds, message): states recorded 13 ms late."""
+    header, joints = store.types["std_msgs/msg/Header"], store.types["sensor_msgs/msg/JointState"]
+    number = store.types["std_msgs/msg/Float64"]
+    nothing = np.zeros(0)
+    extra = {"seq": 0} if "seq" in header.__dataclass_fields__ else {}
+    for k in range(NUM):
+        at = EPOCH * 10**9 + round(STAMPS[k] * 1e9)
+        yield "/effort", number, at - 10**6, number(data=float(STAMPS[k]))
+        values = np.asarray([0.0, ANGLE[k]]), np.asarray([0.0, SPEED[k]])
+        state = joints(
+            header(stamp=stamp(store, STAMPS[k]), frame_id="", **extra),
+            ["other", "hinge"],
+            *values,
+            nothing,
+        )
+        yield "/joint_states", joints, at + 13 * 10**6, state
+
+
+def write_bag(folder, kind):
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    if kind == "ros1":
+        path, store = folder / "log.bag", get_typestore(Stores.ROS1_NOETIC)
+        writer, serialize = Writer1(path), store.serialize_ros1
+    else:
+        plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[kind]
+        path, store = folder / "log", get_typestore(Stores.ROS2_HUMBLE)
+        writer, serialize = Writer(path, version=9, storage_plugin=plugin), store.serialize_cdr
+    connections = {}
+    with writer:
+        for topic, cls, at, message in messages(store):
+            name = cls.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=store)
+            writer.write(connections[topic], at, serialize(message, name))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap", "sqlite3"])
+def test_bags_of_ros_1_and_2(tmp_path, kind):
+    check(convert(tmp_path, write_bag(tmp_path, kind), OF_BAGS, time="")[1])
+
+
+def test_a_single_mcap_file(tmp_path):
+    (file,) = write_bag(tmp_path, "mcap").glob("*.mcap")
+    check(convert(tmp_path, file, OF_BAGS, time="")[1])
+
+
+def test_the_clock_of_the_log_shifts_the_states_against_the_commands(tmp_path):
+    log = write_bag(tmp_path, "mcap")
+    _, recording = convert(tmp_path, log, OF_BAGS, time="", head='clock = "log"')
+    check(recording, torque=np.append(STAMPS[1:], STAMPS[-1]))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("/joint_states.pos", "/joint_state.pos", "unknown topic '/joint_state'; did you mean"),
+        (".position[", ".positon[", "unknown field of /joint_states 'positon'; did you mean"),
+        ("[hinge]", "[hing]", "unknown name in /joint_states 'hing'; did you mean hinge?"),
+        ("velocity[1]", "velocity[2]", "velocity has 2 elements, so it has no [2]"),
+        ("[hinge]", "", "is no number; name one of its elements"),
+        ("/effort.data", "effort", "'effort' names no field of a topic; expected /TOPIC.FIELD"),
+    ],
+)
+def test_refusals_of_bags(tmp_path, capsys, old, new, said):
+    assert old in OF_BAGS
+    log = write_bag(tmp_path, "mcap")
+    assert convert(tmp_path, log, OF_BAGS.replace(old, new, 1), time="")[0] == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert not (tmp_path / "data.csv").exists()
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path, capsys, monkeypatch):
+    log = write_bag(tmp_path, "mcap")
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    assert convert(tmp_path, log, OF_BAGS, time="")[0] == 2
+    assert "pip install 'garat_jax[logs]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("columns", "time", "said"),
+    [
+        (OF_ARRAYS.replace("state[0]", "states[0]"), 'time = "t"', "'states'; did you mean state?"),
+        (OF_ARRAYS.replace("state[0]", "state"), 'time = "t"', "name one column, such as state[0]"),
+        (OF_ARRAYS.replace("state[0]", "state[7]"), 'time = "t"', "it has 2 columns"),
+        (OF_ARRAYS.replace('"u"', '"u[0]"'), 'time = "t"', "has one column only; leave [0] out"),
+        (OF_ARRAYS.replace('"u"', '"short"'), 'time = "t"', "not equally long"),
+        (OF_ARRAYS, "", 'the samples have no time; add time = "NAME"'),
+    ],
+)
+def test_refusals_of_arrays(tmp_path, capsys, columns, time, said):
+    np.savez(tmp_path / "log.npz", **arrays(), short=STAMPS[:5])
+    assert convert(tmp_path, tmp_path / "log.npz", columns, time)[0] == 2
+    assert said in capsys.readouterr().err
+
+
+def test_pickled_arrays_are_never_loaded(tmp_path, capsys):
+    np.savez(tmp_path / "log.npz", t=np.asarray([{}], dtype=object))
+    assert convert(tmp_path, tmp_path / "log.npz", OF_ARRAYS)[0] == 2
+    assert "pickled Python objects, which are never loaded" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["log.mat", "log.npz", "log.mcap", "log.bag", "log.parquet"])
+def test_damaged_logs_are_refused(tmp_path, capsys, name):
+    (tmp_path / name).write_bytes(b"nonsense, and not much of it")
+    assert convert(tmp_path, tmp_path / name, OF_BAGS, time="")[0] == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert name in line
+
+
+def test_other_logs_are_refused(tmp_path, capsys):
+    (tmp_path / "log.txt").touch()
+    assert convert(tmp_path, tmp_path / "log.txt", OF_ARRAYS)[0] == 2
+    assert "unknown kind of log; expected a bag" in capsys.readouterr().err
+    assert cli.main(["convert", "no.mcap", "--map", "m", "--out", "x.csv"]) == 2
+    assert "LOG: there is no file no.mcap" in capsys.readouterr().err

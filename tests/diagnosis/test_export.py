@@ -1,0 +1,174 @@
+"""`garat export`: plain MJCF with the same physics, and words for what MJCF cannot say."""
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from garat_jax import cli, dynamics
+from garat_jax.diagnosis import load_model
+from garat_jax.diagnosis.export import copy_model, export_mjcf
+from garat_jax.diagnosis.model_card import save_card
+from garat_jax.dynamics import Override
+from garat_jax.effects import CATALOGUE
+from garat_jax.errors import UserError
+from tests import models
+
+CARD = """
+format = "garat-model/1"
+mjcf = "arm.xml"
+[[override]]
+element = "body"
+name = "forearm"
+field = "mass"
+value = 1.3
+[[override]]
+element = "joint"
+name = "elbow"
+field = "damping"
+value = 0.4
+"""
+TETRAHEDRON = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+WITH_MESH = """
+<mujoco>
+  <compiler meshdir="parts"/>
+  <asset><mesh name="wedge" file="wedge.obj"/></asset>
+  <worldbody><body name="link"><joint name="hinge" axis="0 1 0"/>
+    <geom type="mesh" mesh="wedge" mass="0.5"/></body></worldbody>
+  <include file="motor.xml"/>
+</mujoco>
+"""
+MOTOR = '<mujoco><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>'
+
+
+def write(folder, card=CARD):
+    (folder / "arm.xml").write_text(models.ARM)
+    path = folder / "arm.toml"
+    path.write_text(card)
+    return path
+
+
+def ctrl_at(k, num):
+    return 0.5 * np.sin(0.1 * k + np.arange(num))
+
+
+def simulate_plain(path, steps=150):
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    for k in range(steps):
+        data.ctrl[:] = ctrl_at(k, model.nu)
+        mujoco.mj_step(model, data)
+    return data.qpos.copy()
+
+
+def simulate_card(model, steps=150):
+    world = model.compile(engine="mujoco")
+    host = world.host.model
+    state = dynamics.initial_state(world, jnp.zeros(host.nq), jnp.zeros(host.nv))
+    for k in range(steps):
+        state = dynamics.step(world, state, jnp.asarray(ctrl_at(k, host.nu), jnp.float32))
+    return np.asarray(state.qpos)
+
+
+def test_overrides_are_in_the_exported_file(tmp_path, capsys):
+    card, out = write(tmp_path), tmp_path / "elsewhere" / "plain.xml"
+    assert cli.main(["export", str(card), "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"MJCF: {out}\n"
+    exported = mujoco.MjModel.from_xml_path(str(out))
+    assert exported.body("forearm").mass[0] == pytest.approx(1.3)
+    assert exported.joint("elbow").damping[0] == pytest.approx(0.4)
+    np.testing.assert_allclose(simulate_plain(out), simulate_card(load_model(card)), atol=2e-4)
+
+
+@pytest.mark.parametrize("kind", CATALOGUE)
+def test_what_mjcf_can_say_is_the_same_physics(tmp_path, kind):
+    model = load_model(write(tmp_path))
+    host = model.compile("mujoco").host.model
+    cls = CATALOGUE[kind]
+    target = cls.targets(host)[0]
+    effect = cls(target=target, **cls.starts(host, target)[0])
+    card = load_model(save_card(tmp_path / "with.toml", model, [effect]))
+    exported = export_mjcf(card, tmp_path / "with.xml")
+    if exported.unsaid:
+        (line,) = exported.unsaid
+        assert kind in line
+        assert "\n" not in line
+    else:
+        expected = simulate_card(card)
+        assert np.abs(expected - simulate_card(model)).max() > 1e-6
+        np.testing.assert_allclose(simulate_plain(exported.path), expected, atol=3e-4)
+
+
+def test_what_mjcf_cannot_say_is_printed(tmp_path, capsys):
+    model = load_model(write(tmp_path))
+    delay = CATALOGUE["actuator_delay"](target="all", delay=0.01)
+    card = save_card(tmp_path / "late.toml", model, [delay])
+    assert cli.main(["export", str(card), "--out", str(tmp_path / "late.xml")]) == 0
+    first, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("not in MJCF: ")
+    assert "actuator_delay at all" in first
+    assert last == f"MJCF: {tmp_path / 'late.xml'}"
+
+
+def with_mesh(folder):
+    (folder / "parts").mkdir(parents=True)
+    (folder / "parts" / "wedge.obj").write_text(TETRAHEDRON)
+    (folder / "motor.xml").write_text(MOTOR)
+    path = folder / "link.xml"
+    path.write_text(WITH_MESH)
+    return path
+
+
+@pytest.mark.parametrize("where", [".", "below", "../beside"])
+def test_meshes_are_found_and_includes_are_part_of_the_file(tmp_path, where):
+    model = load_model(with_mesh(tmp_path / "model"))
+    folder = tmp_path / "model" / where
+    folder.mkdir(exist_ok=True)
+    exported = mujoco.MjModel.from_xml_path(str(export_mjcf(model, folder / "plain.xml").path))
+    assert (exported.nmesh, exported.nu) == (1, 1)
+    assert exported.body("link").mass[0] == pytest.approx(0.5)
+
+
+def test_a_copied_model_has_all_its_files(tmp_path):
+    model = load_model(with_mesh(tmp_path / "model"))
+    copied = copy_model(model, tmp_path / "copy")
+    assert mujoco.MjModel.from_xml_path(str(copied)).nu == 1
+    assert sorted(p.name for p in (tmp_path / "copy").rglob("*.*")) == [
+        "link.xml", "motor.xml", "wedge.obj",
+    ]  # fmt: skip
+
+
+def test_a_model_that_needs_files_elsewhere_is_not_copied(tmp_path):
+    path = with_mesh(tmp_path / "model")
+    (tmp_path / "model" / "parts" / "wedge.obj").rename(tmp_path / "wedge.obj")
+    path.write_text(WITH_MESH.replace('"wedge.obj"', '"../../wedge.obj"'))
+    with pytest.raises(UserError, match="outside its folder, so it cannot be copied"):
+        copy_model(load_model(path), tmp_path / "copy")
+
+
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [("arm.xml", "exists already: give --force"), ("plain.txt", "a name that ends in .xml")],
+)
+def test_refusals(tmp_path, capsys, out, said):
+    card = write(tmp_path)
+    assert cli.main(["export", str(card), "--out", str(tmp_path / out)]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_the_model_itself_is_not_written_over(tmp_path, capsys):
+    write(tmp_path)
+    path = str(tmp_path / "arm.xml")
+    assert cli.main(["export", path, "--out", path, "--force"]) == 2
+    assert "is MODEL itself" in capsys.readouterr().err
+    assert (tmp_path / "arm.xml").read_text() == models.ARM
+
+
+def test_an_override_that_mjcf_does_not_know_is_refused(tmp_path):
+    model = load_model(write(tmp_path))
+    bad = Override("joint", "elbow", "dampin", 1.0)
+    with pytest.raises(UserError, match="did you mean damping"):
+        export_mjcf(
+            type(model)(model.name, model.path, model.mjcf, model.spec, (bad,)),
+            tmp_path / "x.xml",
+        )

@@ -1,0 +1,116 @@
+"""A user's own effect takes part in everything; a bad file is one clear line."""
+
+import dataclasses
+import importlib.metadata
+
+import pytest
+
+from garat_jax import cli
+from garat_jax.diagnosis import load_model
+from garat_jax.diagnosis.diagnose import make_candidates
+from garat_jax.diagnosis.view import repaired
+from garat_jax.effects.catalogue import load_catalogue
+from garat_jax.errors import UserError
+from tests import models
+from tests.diagnosis.test_diagnosis_report import FRICTION
+
+MINE = '''
+"""Effects of my own."""
+import jax
+from flax import struct
+from garat_jax.effects import Effect, parameter
+
+
+@struct.dataclass
+class Spring(Effect):
+    """A spring that pulls back."""
+
+    kind = "my_spring"
+    elements = ("joint",)
+    law = "tau = -k q"
+    identified_by = "rest poses"
+
+    stiffness: jax.Array = parameter(
+        0.0, unit="N m/rad", low=0.0, high=10.0, scale=0.1, source="my bench"
+    )
+
+    def fields(self, model):
+        index = model.host.joint(self.name).id
+        return {"jnt_stiffness": model["jnt_stiffness"].at[index].add(self.stiffness)}
+'''
+
+
+@pytest.fixture
+def mine(tmp_path):
+    path = tmp_path / "my_effects.py"
+    path.write_text(MINE)
+    (tmp_path / "pendulum.xml").write_text(models.PENDULUM)
+    return path
+
+
+def test_it_is_a_candidate_at_every_joint(mine):
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    host = model.compile("mujoco").host.model
+    named = [(e.kind, e.target) for e in make_candidates(model, host)]
+    assert ("my_spring", "joint/hinge") in named
+    found = dataclasses.replace(FRICTION, effect="my_spring", parameters={})
+    assert repaired(model, (found,)).effects[0].kind == "my_spring"
+
+
+def test_it_is_added_listed_and_read_back(mine, capsys):
+    options = ["--effects", str(mine)]
+    out = mine.parent / "new.toml"
+    model = str(mine.parent / "pendulum.xml")
+    adding = ["add", model, "my_spring", "--at", "joint/hinge", "--set", "stiffness=2"]
+    assert cli.main([*adding, "--out", str(out), *options]) == 0
+    assert load_model(out, load_catalogue([mine])).effects[0].stiffness == 2.0
+    assert cli.main(["effects", *options]) == 0
+    assert "my_spring" in capsys.readouterr().out
+    assert cli.main(["effects", "my_spring", *options]) == 0
+    assert "my bench" in capsys.readouterr().out
+    assert cli.main(["export", str(out), "--out", str(out.with_suffix(".xml"))]) == 2
+    assert "unknown effect 'my_spring'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("0.0, unit", "0.0 unit", "line 18: SyntaxError"),
+        ("import jax\n", "import jaxx\n", "line 3: ModuleNotFoundError: No module named 'jaxx'"),
+        ('kind = "my_spring"', 'kind = "viscous_damping"', "'viscous_damping' already"),
+        ('kind = "my_spring"', "", "Spring lacks kind"),
+        ('    law = "tau = -k q"\n', "", "Spring lacks law"),
+        ('("joint",)', '("joints",)', "elements is ('joints',); expected a tuple of body, joint"),
+        ('("joint",)', '"joint"', "expected a tuple of body, joint"),
+        ("@struct.dataclass\n", "", "needs the decorator flax.struct.dataclass"),
+        ("class Spring(Effect)", "class Spring", "holds no effect"),
+    ],
+)
+def test_a_bad_file_is_one_line(mine, capsys, old, new, said):
+    assert old in MINE
+    mine.write_text(MINE.replace(old, new, 1))
+    assert cli.main(["effects", "--effects", str(mine)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert str(mine) in line
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(UserError, match="there is no file"):
+        load_catalogue([tmp_path / "absent.py"])
+    other = tmp_path / "effects.txt"
+    other.touch()
+    with pytest.raises(UserError, match=r"expected a Python file \(.py\)"):
+        load_catalogue([other])
+
+
+def test_entry_points_are_loaded_and_a_bad_one_is_named(mine, monkeypatch):
+    (cls,) = (c for k, c in load_catalogue([mine]).items() if k == "my_spring")
+    group = "garat_jax.effects"
+    module = cls.__module__
+    points = [importlib.metadata.EntryPoint("spring", f"{module}:Spring", group)]
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
+    assert load_catalogue()["my_spring"] is cls
+    points[:] = [importlib.metadata.EntryPoint("spring", f"{module}:Absent", group)]
+    with pytest.raises(UserError, match=r"entry point spring .*AttributeError"):
+        load_catalogue()
