@@ -1,12 +1,13 @@
 """Make "measurements" that hide one physical effect, with C MuJoCo alone.
 
 Nothing here uses the catalogue's laws or the engine: effects are native fields of MuJoCo, forces
-and late commands in a plain `mj_step` loop at a finer timestep than the model's.
+and changed commands in a plain `mj_step` loop at a finer timestep than the model's.
 """
 
 import csv
 import dataclasses
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import mujoco
 import numpy as np
 
 REFINEMENT = 32
-"""Physics substeps in one timestep of the model under diagnosis."""
+"""Physics substeps in one timestep of the model under diagnosis, at least."""
 ANGLE_NOISE, SPEED_NOISE = 1e-3, 1e-2
 """Standard deviation of the sensors' white noise, rad and rad/s."""
 SIZE_RANGE = (0.7, 1.4)
@@ -47,17 +48,17 @@ class Secret:
         element: What it acts on: `joint`, `actuator`, `body`, `world`, or "" for nothing.
         parameters: Typical size of each parameter; "no effect" plus a change that is scaled.
         change: Changes the spec before it is compiled.
-        force: Generalised force on the first joint at (time [s], speed [rad/s]), N m.
+        force: Generalised force on the first joint at a time [s], N m.
         late: Seconds by which commands are late.
-        gain: Factor on the command at a time [s].
+        gain: Factor on the commands at times [s].
     """
 
     element: str
     parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
     change: Callable[[mujoco.MjSpec, Mapping[str, float]], None] = lambda spec, p: None
-    force: Callable[[float, float, Mapping[str, float]], float] = lambda t, v, p: 0.0
+    force: Callable[[float, Mapping[str, float]], float] | None = None
     late: Callable[[Mapping[str, float]], float] = lambda p: 0.0
-    gain: Callable[[float, Mapping[str, float]], float] = lambda t, p: 1.0
+    gain: Callable[[np.ndarray, Mapping[str, float]], np.ndarray | float] = lambda t, p: 1.0
 
 
 def _add_damping(spec: mujoco.MjSpec, p: Mapping[str, float]) -> None:
@@ -73,11 +74,16 @@ def _add_armature(spec: mujoco.MjSpec, p: Mapping[str, float]) -> None:
 
 
 def _add_payload(spec: mujoco.MjSpec, p: Mapping[str, float]) -> None:
-    spec.bodies[-1].add_geom(
+    add_point_mass(spec.bodies[-1], p["mass"], (0.0, 0.0, p["z"]))
+
+
+def add_point_mass(body: mujoco.MjsBody, mass: float, place: Sequence[float]) -> None:
+    """Fix a mass [kg] to a body at a place in its frame [m]; it touches nothing."""
+    body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
         size=[1e-3, 0, 0],
-        pos=[0, 0, p["z"]],
-        mass=p["mass"],
+        pos=place,
+        mass=mass,
         contype=0,
         conaffinity=0,
     )
@@ -91,17 +97,17 @@ SECRETS: dict[str, Secret] = {
     "none": Secret(""),
     "viscous_damping": Secret("joint", {"coefficient": 0.03}, change=_add_damping),
     "coulomb_friction": Secret("joint", {"torque": 0.06}, change=_add_friction),
-    "torque_offset": Secret("joint", {"torque": 0.1}, force=lambda t, v, p: p["torque"]),
+    "torque_offset": Secret("joint", {"torque": 0.1}, force=lambda t, p: p["torque"]),
     "rotor_inertia": Secret("joint", {"inertia": 0.01}, change=_add_armature),
     "motor_gain": Secret("actuator", {"scale": 0.25}, gain=lambda t, p: p["scale"]),
     "actuator_delay": Secret("actuator", {"delay": 0.02}, late=lambda p: p["delay"]),
     "payload_mass": Secret("body", {"mass": 0.1, "z": -0.5}, change=_add_payload),
     "gravity_scale": Secret("world", {"scale": 0.15}, change=_scale_gravity),
     "periodic_disturbance": Secret(
-        "joint", {"torque": 0.15}, force=lambda t, v, p: p["torque"] * np.sin(2 * np.pi * 1.7 * t)
+        "joint", {"torque": 0.15}, force=lambda t, p: p["torque"] * np.sin(2 * np.pi * 1.7 * t)
     ),
     "fading_gain": Secret(
-        "actuator", {"rate": 0.05}, gain=lambda t, p: max(0.0, 1.0 - p["rate"] * t)
+        "actuator", {"rate": 0.05}, gain=lambda t, p: np.maximum(0.0, 1.0 - p["rate"] * t)[:, None]
     ),
 }
 OUTSIDE = ("periodic_disturbance", "fading_gain")
@@ -135,27 +141,72 @@ def excite(index: int, time: np.ndarray, limit: float, rng: np.random.Generator)
     return limit * np.stack([sines, steps, slow, 0.5 * sines + 0.5 * steps])[index % 4]
 
 
+def finer_timestep(timestep: float, interval: float) -> float:
+    """Return the largest timestep [s] that refines a model's enough and divides a sample."""
+    return interval / int(np.ceil(interval * REFINEMENT / timestep - 1e-9))
+
+
+def delayed(ctrl: np.ndarray, steps: int) -> np.ndarray:
+    """Return commands [N, nu] that come some steps late; the first one is held before."""
+    return ctrl[np.maximum(np.arange(len(ctrl)) - steps, 0)]
+
+
 def simulate(
-    mjcf: Path, secret: Secret, parameters: Mapping[str, float], time: np.ndarray, ctrl: np.ndarray
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    ctrl: np.ndarray,
+    samples: np.ndarray,
+    act: Callable[[mujoco.MjData], None] | None = None,
 ) -> np.ndarray:
-    """Step C MuJoCo under held commands and return the true state at each sample, [T, nq + nv]."""
+    """Step C MuJoCo under commands that may change every step.
+
+    Args:
+        model: The truth, with its fine timestep.
+        data: The initial state; changed.
+        ctrl: Commands, [N, nu].
+        samples: Steps before which the state is sampled, [T], not decreasing, below N.
+        act: Writes forces before every step.
+
+    Returns:
+        The true state at each sample, [T, nq + nv].
+    """
+    states = np.zeros((len(samples), model.nq + model.nv))
+    changes = 1 + np.flatnonzero(np.any(np.diff(ctrl, axis=0) != 0, axis=1))
+    stops = np.unique(np.concatenate([[0], changes, samples, [len(ctrl)]]))
+    stops = np.arange(len(ctrl) + 1) if act else stops
+    row = 0
+    for begin, end in itertools.pairwise(stops):
+        while row < len(samples) and samples[row] == begin:
+            states[row] = np.concatenate([data.qpos, data.qvel])
+            row += 1
+        data.ctrl[:] = ctrl[begin]
+        if act:
+            act(data)
+        mujoco.mj_step(model, data, end - begin)
+    return states
+
+
+def _measure(
+    mjcf: Path, kind: str, parameters: Mapping[str, float], time: np.ndarray, ctrl: np.ndarray
+) -> np.ndarray:
+    """Return the true state [T, nq + nv] of a model with a secret under held commands [T, nu]."""
+    secret = SECRETS[kind]
     spec = mujoco.MjSpec.from_file(str(mjcf))
     secret.change(spec, parameters)
-    rate = time[1] - time[0]
-    substeps = int(np.ceil(rate / spec.option.timestep - 1e-9)) * REFINEMENT
-    spec.option.timestep = rate / substeps
+    interval = time[1] - time[0]
+    spec.option.timestep = finer_timestep(spec.option.timestep, interval)
     model = spec.compile()
-    data = mujoco.MjData(model)
-    delay = round(secret.late(parameters) / model.opt.timestep)
-    states = np.zeros((len(time), model.nq + model.nv))
-    for k in range(len(time)):
-        states[k] = np.concatenate([data.qpos, data.qvel])
-        for i in range(substeps):
-            row = max(k * substeps + i - delay, 0) // substeps
-            data.ctrl[:] = ctrl[row] * secret.gain(data.time, parameters)
-            data.qfrc_applied[0] = secret.force(data.time, data.qvel[0], parameters)
-            mujoco.mj_step(model, data)
-    return states
+    step, substeps = model.opt.timestep, round(interval / model.opt.timestep)
+    fine = delayed(np.repeat(ctrl, substeps, axis=0), round(secret.late(parameters) / step))
+    fine = fine * secret.gain(step * np.arange(len(fine)), parameters)
+    force = secret.force
+
+    def act(data: mujoco.MjData) -> None:
+        assert force
+        data.qfrc_applied[0] = force(data.time, parameters)
+
+    samples = np.arange(len(time)) * substeps
+    return simulate(model, mujoco.MjData(model), fine, samples, act if force else None)
 
 
 def make_recordings(
@@ -189,11 +240,11 @@ def make_recordings(
     paths = []
     for index in range(num_recordings):
         ctrl = excite(index, time, 0.4 * model.actuator_ctrlrange[0, 1], rng)
-        state = simulate(mjcf, SECRETS[kind], parameters, time, ctrl[:, None])
+        state = _measure(mjcf, kind, parameters, time, ctrl[:, None])
         state = state + rng.normal(size=state.shape) * [ANGLE_NOISE, SPEED_NOISE]
         paths.append(out / f"recording_{index}.csv")
         header = ["time", f"qpos.{joint}", f"qvel.{joint}", f"ctrl.{actuator}"]
-        _write(paths[-1], header, np.column_stack([time, state, ctrl]))
+        write_csv(paths[-1], header, np.column_stack([time, state, ctrl]))
     num_holdout = max(1, num_recordings // 4)
     names = {"joint": joint, "actuator": actuator, "body": model.body(model.nbody - 1).name}
     element = SECRETS[kind].element
@@ -203,7 +254,8 @@ def make_recordings(
     )
 
 
-def _write(path: Path, header: list[str], rows: np.ndarray) -> None:
+def write_csv(path: Path, header: Sequence[str], rows: np.ndarray) -> None:
+    """Write a recording: column names and rows [T, columns]."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)

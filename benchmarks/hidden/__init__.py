@@ -1,0 +1,1 @@
+"""Robots with hidden physical effects, made by C MuJoCo alone, and what a diagnosis is held to."""

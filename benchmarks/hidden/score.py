@@ -1,0 +1,236 @@
+"""Score a diagnosis against what was hidden, and add the scores up beside what they are held to."""
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from garat_jax.diagnosis import Diagnosis, Model, Recording
+from garat_jax.diagnosis.diagnose import split, thin
+from garat_jax.diagnosis.fit import Problem, settle
+from garat_jax.diagnosis.rank import make_metric
+from garat_jax.diagnosis.results import Candidate, Named
+from garat_jax.diagnosis.simulate import Simulator, choose_grid, cut
+from garat_jax.dynamics import native_model
+from garat_jax.effects import CATALOGUE
+
+from .generate import Truth
+from .secrets import Secret
+
+DELAY = "actuator_delay"
+"""The kind that a nuisance delay may be named as."""
+CLOSE = 0.05
+HELD_CLOSE = {
+    ("viscous_damping", "coefficient"),
+    ("coulomb_friction", "torque"),
+    ("motor_gain", "scale"),
+    ("payload_mass", "mass"),
+    ("actuator_delay", "delay"),
+    ("sensor_delay", "delay"),
+}
+"""Parameters that have to come within `CLOSE`: friction, gain, mass, delay."""
+LARGEST_RATIO = 1.25
+"""Held-out error after adding, over that of the true model at the nominal timestep."""
+
+
+def place(model: mujoco.MjModel, target: str) -> str:
+    """Return the body where a target is: a joint's, an actuator's joint's, a geom's."""
+    element, _, name = target.partition("/")
+    if element == "actuator":
+        return model.body(model.joint(int(model.actuator(name).trnid[0])).bodyid[0]).name
+    if element == "joint":
+        return model.body(model.joint(name).bodyid[0]).name
+    if element == "geom":
+        return model.body(model.geom(name).bodyid[0]).name
+    if element == "all" and model.nu == 1:
+        return place(model, f"actuator/{model.actuator(0).name}")
+    return name or element
+
+
+def names(candidate: Candidate) -> tuple[Named, ...]:
+    """Return a candidate and what the recordings cannot tell from it."""
+    return (candidate.named, *candidate.indistinguishable_from)
+
+
+def names_kind(candidate: Candidate, secret: Secret) -> bool:
+    """Say whether a candidate, or its equivalence set, names a secret's kind."""
+    return any(named.effect == secret.kind for named in names(candidate))
+
+
+def names_place(candidate: Candidate, secret: Secret, model: mujoco.MjModel) -> bool:
+    """Say whether it names the secret's place, with the right kind or as its own first place."""
+    at = place(model, secret.target)
+    same = [n for n in names(candidate) if n.effect == secret.kind]
+    return any(place(model, n.target) == at for n in (candidate.named, *same))
+
+
+def finds(candidate: Candidate, secret: Secret, model: mujoco.MjModel) -> bool:
+    """Say whether it, or its equivalence set, names kind and place together."""
+    at = place(model, secret.target)
+    return any(n.effect == secret.kind and place(model, n.target) == at for n in names(candidate))
+
+
+def score(found: Diagnosis, truth: Truth, model: mujoco.MjModel) -> dict[str, Any]:
+    """Return what of a set's truth was found.
+
+    Where all commands were late as a nuisance, naming a delay is right and is left out here.
+    """
+    nuisance = (DELAY,) if truth.delay > 0 else ()
+    selected = [c for c in found.selected if c.effect not in nuisance]
+    ranked = [*selected, *(c for c in found.candidates if c.effect not in nuisance)]
+    first = ranked[0] if ranked else None
+    row: dict[str, Any] = {
+        "verdict": found.verdict,
+        "claimed": [[str(n) for n in names(c)] for c in found.selected],
+        "first": [str(n) for n in names(first)] if first else [],
+        "first_fails": "" if first is None or first.passes else first.why,
+        "unexplained_share": found.error.unexplained_share,
+        "seconds": found.seconds,
+    }
+    category = truth.case.category
+    if category == "clean":
+        return row | {"ok": not selected}
+    if category == "outside":
+        return row | {"ok": found.verdict == "unexplained"}
+    estimates = [
+        estimate
+        for secret in truth.secrets
+        for candidate in selected
+        if finds(candidate, secret, model) and candidate.effect == secret.kind
+        for estimate in _estimates(candidate, secret)
+    ]
+    row["estimates"] = estimates
+    if category == "pair":
+        seen = [any(finds(c, s, model) for c in selected) for s in truth.secrets]
+        return row | {"found": seen, "ok": all(seen)}
+    secret = truth.secrets[0]
+    kind = first is not None and names_kind(first, secret)
+    at = first is not None and names_place(first, secret, model)
+    return row | {
+        "kind_first": kind,
+        "kind_claimed": bool(selected) and kind,
+        "alone": first is not None and len(names(first)) == 1,
+        "place_right": at,
+        "ok": kind and at,
+    }
+
+
+def _estimates(candidate: Candidate, secret: Secret) -> list[dict[str, Any]]:
+    rows = []
+    for name, value in candidate.parameters.items():
+        if name in secret.parameters and np.isfinite(value.low):
+            true = secret[name]
+            rows.append(
+                {
+                    "parameter": f"{secret.kind}.{name}",
+                    "true": true,
+                    "estimate": value.estimate,
+                    "low": value.low,
+                    "high": value.high,
+                    "relative_error": abs(value.estimate - true) / max(abs(true), 1e-12),
+                    "covered": bool(value.low <= true <= value.high),
+                    "held_close": (secret.kind, name) in HELD_CLOSE,
+                }
+            )
+    return rows
+
+
+def true_error(
+    model: Model,
+    recordings: Sequence[Recording],
+    holdout: Sequence[Recording],
+    found: Diagnosis,
+    truth: Truth,
+) -> float | None:
+    """Return the held-out error of the catalogue's effects at their true parameters.
+
+    Metric, segments and timestep are those of the diagnosis; initial states are settled alike.
+    None where the catalogue has no such effect: outside it, and with a nuisance delay unless the
+    catalogue has delays.
+    """
+    effects = _true_effects(truth)
+    stated = re.search(r"segments of ([\d.e-]+) s", found.error.metric)
+    if effects is None or stated is None:
+        return None
+    fitted, held_out, _ = split(recordings, holdout)
+    everything = thin((*fitted, *held_out))
+    true = dataclasses.replace(model, effects=(*model.effects, *effects))
+    grid = choose_grid(everything, native_model(true.compile(engine="mujoco")).opt.timestep)
+    segments = cut(everything, grid, float(stated[1]))
+    problem = Problem(
+        Simulator(true, (), grid),
+        Simulator(true, (), grid, refine=2),
+        segments,
+        segments.recording < len(fitted),
+        grid.interval * grid.per_sample,
+    )
+    settled = settle(problem, problem.simulator.base, segments.start)
+    return make_metric(problem).error(settled.residual, ~problem.fitted)
+
+
+def _true_effects(truth: Truth) -> list | None:
+    wanted = [(s.kind, s.target, s.parameters) for s in truth.secrets]
+    if truth.delay > 0:
+        wanted.append((DELAY, "all", {"delay": truth.delay}))
+    if not wanted or any(kind not in CATALOGUE for kind, _, _ in wanted):
+        return None
+    return [CATALOGUE[kind](target=at, **parameters) for kind, at, parameters in wanted]
+
+
+NOT_YET = "not in the catalogue yet"
+
+
+def aggregate(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Add rows up: each measure beside its target, and the cases that fall short.
+
+    Sets whose kind the catalogue lacks are failures of no one and successes of no one: they have a
+    line of their own.
+    """
+    done = [row for row in rows if row["status"] != NOT_YET]
+    of = {name: [r for r in done if r["category"] == name] for name in CATEGORIES}
+    singles = of["single"]
+    lines = [
+        _share("right kind first", singles, "kind_first", 0.95),
+        _share("right kind first and past every gate", singles, "kind_claimed", None),
+        _share("of these without an equivalent", [r for r in singles if r.get("kind_first")],
+               "alone", None),
+        _share("right joint or body", singles, "place_right", 0.95),
+        _share("pairs, both found", of["pair"], "ok", 0.85),
+        _share("clean, nothing claimed", of["clean"], "ok", 0.95),
+        _share("outside, unexplained", of["outside"], "ok", 0.90),
+    ]  # fmt: skip
+    estimates = [e | {"case": r["case"]} for r in done for e in r.get("estimates", [])]
+    for estimate in estimates:
+        estimate["close"] = estimate["relative_error"] <= CLOSE
+    close = [e for e in estimates if e["held_close"]]
+    lines += [
+        _share("estimates of friction, gain, mass, delay within 5 %", close, "close", 0.95),
+        _share("all estimates within 5 %", estimates, "close", None),
+        _share("intervals that cover", estimates, "covered", 0.90, 0.98),
+    ]
+    compared = [{**r, "near": r["ratio"] <= LARGEST_RATIO} for r in done if r.get("ratio")]
+    lines.append(_share("error after adding at most 1.25 × the true model's", compared, "near", 1))
+    seconds = [r["seconds"] for r in done if "seconds" in r]
+    if seconds:
+        median, most = float(np.median(seconds)), float(np.max(seconds))
+        lines.append({"measure": "seconds a set", "value": median, "largest": most})
+    missing = sorted(r["case"] for r in rows if r["status"] == NOT_YET)
+    lines.append({"measure": NOT_YET, "count": len(missing), "cases": missing})
+    return lines
+
+
+CATEGORIES = ("single", "pair", "clean", "outside")
+
+
+def _share(measure: str, rows, key: str, low: float | None, high: float = 1.0) -> dict[str, Any]:
+    """Return the share of rows that have it; rows that failed with an error do not."""
+    count = len(rows)
+    value = sum(bool(row.get(key)) for row in rows) / count if count else None
+    line: dict[str, Any] = {"measure": measure, "value": value, "count": count}
+    if low is not None:
+        line |= {"target": [low, high], "met": value is not None and low <= value <= high}
+        line["short"] = sorted({row["case"] for row in rows if not row.get(key)})
+    return line

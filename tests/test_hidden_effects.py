@@ -1,0 +1,234 @@
+"""The benchmark's secrets do what they say, against closed forms and MuJoCo's own quantities."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from benchmarks.hidden.bodies import CATALOGUED, SECRETS
+from benchmarks.hidden.generate import Case, Surveys, Truth, add_noise, draw, generate, list_cases
+from benchmarks.hidden.measure import experiment, measure
+from benchmarks.hidden.robots import ROBOTS
+from benchmarks.hidden.score import NOT_YET, aggregate, score
+from benchmarks.hidden.secrets import OUTSIDE, SIZES
+from garat_jax.diagnosis import Recording
+from garat_jax.diagnosis.results import Candidate, Estimate, Interval, Named
+
+SCENES = Surveys()
+TIME = np.arange(60) / 200.0
+
+
+def made(kind: str, robot: str, target: str, **parameters):
+    return SECRETS[kind](target, parameters), SCENES[robot]
+
+
+def truth_model(secret, scene) -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_file(str(scene.robot.mjcf))
+    secret.change(spec, scene)
+    model = spec.compile()
+    secret.tune(model)
+    return model
+
+
+def added_force(secret, scene, qvel, model=None) -> np.ndarray:
+    """What a secret pushes with at a velocity, at the start pose."""
+    model = model or truth_model(secret, scene)
+    data = mujoco.MjData(model)
+    scene.robot.set_start(model, data)
+    data.qvel[:] = qvel
+    mujoco.mj_forward(model, data)
+    secret.act(model, scene)(data)
+    return data.qfrc_applied
+
+
+def test_the_list_has_every_kind_at_three_sizes_pairs_clean_ones_and_outsiders():
+    cases = list_cases(0)
+    assert len(CATALOGUED) == 29
+    assert len({case.name for case in cases}) == len(cases) == 29 * 3 + 60
+    singles = {(c.kinds[0], c.size) for c in cases if c.category == "single"}
+    assert singles == {(kind, size) for kind in CATALOGUED for size in SIZES}
+    counts = [sum(c.category == name for c in cases) for name in ("pair", "clean", "outside")]
+    assert counts == [20, 20, 20]
+    assert {c.kinds[0] for c in cases if c.category == "outside"} == set(OUTSIDE)
+    assert list_cases(0) == cases != list_cases(1)
+
+
+@pytest.mark.parametrize("kind", SECRETS)
+def test_every_secret_can_be_drawn_and_changes_what_is_measured(kind):
+    robot = {"contact_friction": "puck", "contact_compliance": "hopper"}.get(kind, "arm2")
+    scene, cls = SCENES[robot], SECRETS[kind]
+    target = cls.targets(scene)[0]
+    rng = np.random.default_rng(0)
+    secret = cls(target, cls.draw(scene, target.partition("/")[2], 2.0, rng))
+    time, ctrl = experiment(scene, 0, 200.0, 2.5, (0, 0))
+    clean, hidden = (measure(scene, some, time, ctrl, 0.0) for some in ((), (secret,)))
+    assert hidden.shape == clean.shape == (len(time), 2 * scene.model.nv)
+    assert np.isfinite(hidden).all()
+    noise = np.repeat(scene.robot.noise, scene.model.nv)
+    assert np.max(np.abs(hidden - clean) / noise) > 3.0
+
+
+def test_forces_follow_their_laws():
+    speed = np.asarray([0.7, -1.5])
+    drag, scene = made("quadratic_drag", "arm2", "joint/elbow", coefficient=0.2)
+    assert added_force(drag, scene, speed) == pytest.approx([0.0, 0.2 * 1.5**2])
+    back_emf, _ = made("back_emf", "arm2", "actuator/elbow", coefficient=0.2)
+    assert added_force(back_emf, scene, speed) == pytest.approx([0.0, 0.3])
+    cogging, _ = made("cogging_torque", "arm2", "joint/elbow", amplitude=0.1, periods=6, phase=0.5)
+    assert added_force(cogging, scene, speed) == pytest.approx([0.0, 0.1 * np.sin(0.5)])
+
+
+def test_dry_friction_has_the_size_of_its_law():
+    numbers = {"coulomb": 0.1, "static": 0.3, "velocity": 0.5}
+    stribeck, scene = made("stribeck_friction", "arm2", "joint/elbow", **numbers)
+    model = truth_model(stribeck, scene)
+    for speed, size in ((0.0, 0.3), (0.5, 0.1 + 0.2 * np.exp(-1)), (50.0, 0.1)):
+        added_force(stribeck, scene, [0.0, speed], model)
+        assert model.dof_frictionloss[1] == pytest.approx(size)
+
+
+def test_gravity_turns_by_roll_and_then_pitch():
+    tilt, scene = made("gravity_tilt", "arm2", "world", roll=0.3, pitch=-0.2)
+    g = 9.81
+    expected = [g * np.cos(0.3) * np.sin(0.2), g * np.sin(0.3), -g * np.cos(0.3) * np.cos(0.2)]
+    assert truth_model(tilt, scene).opt.gravity == pytest.approx(expected)
+
+
+def test_a_payload_and_a_moved_centre_of_mass_have_the_closed_forms_inertia():
+    load, scene = made("payload_mass", "pendulum", "body/pole", mass=0.2, x=0.0, y=0.0, z=-0.4)
+    before, after = scene.model, truth_model(load, scene)
+    gained = after.dof_M0 - before.dof_M0
+    assert gained == pytest.approx([0.2 * 0.4**2], rel=1e-4)
+    moved, _ = made("com_offset", "pendulum", "body/pole", x=0.0, y=0.0, z=-0.05)
+    gained = truth_model(moved, scene).dof_M0 - before.dof_M0
+    assert gained == pytest.approx([0.6 * (0.3**2 - 0.25**2)], rel=1e-4)
+
+
+def test_commands_are_late_slow_or_lost_as_said():
+    scene = SCENES["arm2"]
+    ctrl = np.zeros((400, 2))
+    ctrl[100:] = 1.0
+    step = scene.model.opt.timestep
+    late = SECRETS["actuator_delay"]("actuator/elbow", {"delay": 20 * step})
+    changed = late.command(scene.model, ctrl)
+    assert (np.argmax(changed[:, 0] > 0), np.argmax(changed[:, 1] > 0)) == (100, 120)
+    slow = SECRETS["actuator_lag"]("all", {"time_constant": 50 * step})
+    changed = slow.command(scene.model, ctrl)
+    assert changed[149] == pytest.approx([1 - np.exp(-1)] * 2)
+    dead = SECRETS["motor_deadband"]("actuator/elbow", {"width": 0.3})
+    assert dead.command(scene.model, ctrl)[-1] == pytest.approx([1.0, 0.7])
+    curve = SECRETS["motor_curve"]("actuator/elbow", {"saturation": 2.0, "linear": 1.0})
+    assert curve.bend(np.asarray([0.5, -1.0, 2.0, 99.0])) == pytest.approx(
+        [0.5, -1.0, 2.0 - np.exp(-1), 2.0]
+    )
+
+
+def test_late_sensors_see_the_past_and_encoders_are_off_where_said():
+    scene = SCENES["arm2"]
+    ctrl = np.ones((len(TIME), 2))
+    clean = measure(scene, (), TIME, ctrl, 0.0)
+    late = measure(scene, (SECRETS["sensor_delay"]("all", {"delay": 0.01}),), TIME, ctrl, 0.0)
+    assert late[2:] == pytest.approx(clean[:-2], abs=1e-12)
+    offset = SECRETS["encoder_offset"]("joint/elbow", {"offset": 0.1})
+    off = measure(scene, (offset,), TIME, ctrl, 0.0)
+    assert off - clean == pytest.approx(np.tile([0, 0.1, 0, 0], (len(TIME), 1)), abs=1e-12)
+    scale = SECRETS["encoder_scale"]("joint/elbow", {"scale": 1.2})
+    scaled = measure(scene, (scale,), TIME, ctrl, 0.0)
+    assert scaled == pytest.approx(clean * [1, 1.2, 1, 1.2])
+
+
+def test_a_gear_without_play_is_the_plain_joint_and_one_with_play_turns_freely_within_it():
+    scene = SCENES["pendulum"]
+    ctrl = np.full((len(TIME), 1), 0.5)
+    clean = measure(scene, (), TIME, ctrl, 0.0)
+    stiff = SECRETS["joint_flexibility"]("joint/hinge", {"stiffness": 3e4, "damping": 5.0})
+    assert measure(scene, (stiff,), TIME, ctrl, 0.0) == pytest.approx(clean, abs=2e-3)
+    play = SECRETS["backlash"]("joint/hinge", {"gap": 0.2})
+    hidden = measure(scene, (play,), TIME, ctrl, 0.0)
+    inertia = scene.model.dof_armature[0]
+    alone = np.sqrt(2 * 0.1 * inertia / 0.5)  # the rotor crosses half the gap before the link moves
+    assert np.all(hidden[: int(0.9 * alone * 200)] == 0)
+    assert hidden[-1, 0] > 0.5 * clean[-1, 0]
+
+
+@pytest.mark.parametrize("noise", ["white", "coloured", "quantised"])
+def test_noise_has_its_size(noise):
+    case = Case("clean-00", "clean", (), "medium", (0, 1))
+    truth = Truth(case, "arm2", (), 200.0, 4.0, noise, 0.0, ())
+    rng = np.random.default_rng(0)
+    states = rng.uniform(-1, 1, (20_000, 4))
+    error = add_noise(states, truth, rng) - states
+    assert error.std(axis=0) == pytest.approx(np.repeat(ROBOTS["arm2"].noise, 2), rel=0.05)
+
+
+def test_a_set_is_drawn_from_its_seed_and_reads_as_recordings(tmp_path):
+    case = next(c for c in list_cases(0) if c.name == "torque_offset-medium")
+    truth = draw(case, SCENES, ["pendulum"])
+    assert truth == draw(case, SCENES, ["pendulum"])
+    short = dataclasses.replace(truth, seconds=1.0)
+    paths = generate(short, SCENES["pendulum"], tmp_path)
+    recordings = [Recording.read(path, SCENES["pendulum"].model) for path in paths]
+    assert [len(r.time) for r in recordings] == [round(truth.rate)] * 4
+    assert not any(warning for r in recordings for warning in r.warnings)
+    written = json.loads((tmp_path / "truth.json").read_text())
+    assert written["secrets"][0]["parameters"] == dict(truth.secrets[0].parameters)
+
+
+def candidate(effect: str, target: str, alike=(), **parameters) -> Candidate:
+    nothing = Interval(0.0, 0.0, 0.0)
+    values = {n: Estimate(*numbers, unit="1") for n, numbers in parameters.items()}
+    named = tuple(Named(*pair) for pair in alike)
+    return Candidate(effect, target, values, 1.0, 0.0, 0.0, nothing, 1.0, named, True, "")
+
+
+def scored(truth, *selected, verdict="missing_effect"):
+    found = SimpleNamespace(
+        verdict=verdict,
+        selected=selected,
+        candidates=selected,
+        error=SimpleNamespace(unexplained_share=0.0),
+        seconds=1.0,
+    )
+    return score(found, truth, SCENES["arm2"].model)
+
+
+def test_scores_count_kind_place_and_intervals():
+    case = Case("coulomb_friction-small", "single", ("coulomb_friction",), "small", (0, 1))
+    secret = SECRETS["coulomb_friction"]("joint/elbow", {"torque": 0.1})
+    truth = Truth(case, "arm2", (secret,), 200.0, 4.0, "white", 0.0, (9.0,))
+    right = scored(truth, candidate("coulomb_friction", "joint/elbow", torque=(0.104, 0.09, 0.11)))
+    assert right["ok"] and right["estimates"][0]["covered"]
+    assert right["estimates"][0]["relative_error"] == pytest.approx(0.04)
+    alike = [("coulomb_friction", "joint/elbow")]
+    honest = scored(truth, candidate("viscous_damping", "joint/shoulder", alike))
+    assert honest["ok"] and not honest["alone"] and not honest["estimates"]
+    elsewhere = scored(truth, candidate("coulomb_friction", "joint/shoulder"))
+    assert elsewhere["kind_first"] and not elsewhere["place_right"]
+    other = scored(truth, candidate("motor_gain", "actuator/elbow"))
+    assert not other["kind_first"] and other["place_right"]
+    delayed = dataclasses.replace(truth, delay=0.02)
+    assert scored(delayed, candidate("actuator_delay", "all"), right_one())["ok"]
+    assert not scored(truth, candidate("actuator_delay", "all"), right_one())["ok"]
+    clean = dataclasses.replace(truth, case=case._replace(category="clean"), secrets=())
+    assert not scored(clean, right_one())["ok"] and scored(clean)["ok"]
+
+
+def right_one() -> Candidate:
+    return candidate("coulomb_friction", "joint/elbow")
+
+
+def test_a_kind_that_the_catalogue_lacks_is_no_success():
+    base = {"category": "single", "status": "done", "seconds": 1.0}
+    rows = [
+        base | {"case": "a", "kind_first": True, "place_right": True},
+        base | {"case": "b", "status": "error: it failed"},
+        {"case": "c", "category": "single", "status": NOT_YET},
+    ]
+    table = {line["measure"]: line for line in aggregate(rows)}
+    first = table["right kind first"]
+    assert (first["value"], first["count"], first["met"]) == (0.5, 2, False)
+    assert first["short"] == ["b"]
+    assert table[NOT_YET]["cases"] == ["c"]
