@@ -135,11 +135,18 @@ class HostModel:
         return np.concatenate(parts, axis=1)
 
     def _trace_batch(self, num_substeps: int, repeat: int, batch: Batch, controls) -> np.ndarray:
-        """Step a batch under controls [num, .., nu + nv], each held for `repeat` substeps."""
+        """Step a batch under controls [num, .., nu + nv], each held for `repeat` substeps.
+
+        MuJoCo stops a simulation that diverges and repeats its last state; here it is NaN.
+        """
         controls = np.repeat(controls, repeat, axis=1)
-        found = batch.rollout(controls.shape[1], controls, int(INPUTS), record=("qpos", "qvel"))
+        length = controls.shape[1]
+        end = batch.bind("time").reshape(-1) + (length - 0.5) * self.model.opt.timestep
+        found = batch.rollout(length, controls, int(INPUTS), record=("qpos", "qvel"))
         path = np.concatenate([found["qpos"], found["qvel"]], axis=2)
-        return path[:, num_substeps - 1 :: num_substeps]
+        path = path[:, num_substeps - 1 :: num_substeps]
+        path[batch.bind("time").reshape(-1) < end] = np.nan
+        return path
 
     @functools.cached_property
     def _batches(self) -> dict:

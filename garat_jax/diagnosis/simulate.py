@@ -27,7 +27,7 @@ UNIFORM = 0.01
 """Largest deviation of a sampling interval, relative to their median, that counts as uniform."""
 SHORTEST = 10
 """Samples that a segment must have."""
-BATCH_SIZES = (1, 4, 8, 16, 32)
+BATCH_SIZES = (1, 4, 16)
 """Each width of a batch is compiled once, so widths are rounded up to one of these."""
 SMALLEST_NOISE = 1e-4
 """Noise assumed at least, relative to the signal's standard deviation."""
@@ -221,6 +221,9 @@ def _piece(recording: Recording, a: int, b: int, length: int, steps: int, warm_u
 class Simulator:
     """A model with candidate effects, simulated over segments.
 
+    Parameters under which no effect looks at the state on the way take one call of C MuJoCo for a
+    whole segment, with the effects that would look left out; others take a call a physics substep.
+
     Attributes:
         effects: The candidate effects; the model's own effects stay as they are.
         slots: The candidate effects' parameters, in the order of `theta`.
@@ -251,7 +254,15 @@ class Simulator:
             for p in effect.parameters()
         )
         self.base = np.asarray([slot.base for slot in self.slots])
-        self._run = jax.jit(jax.vmap(jax.vmap(self._predict, (None, 0, 0, 0)), (0, 0, None, None)))
+        looking = [effect.reads_state or effect.notes for effect in candidates]
+        self._looks = np.asarray([looking[slot.effect] for slot in self.slots], bool)
+        self._blind = [i for i, looks in enumerate(looking) if not looks]
+        own = self._world.replace(effects=self._world.effects[: self._num_own])
+        self._any_at_once = dynamics.steps_at_once(own)
+        self._run, self._run_at_once = (
+            jax.jit(jax.vmap(jax.vmap(one, (None, 0, 0, 0)), (0, 0, None, None)))
+            for one in (self._predict, self._predict_at_once)
+        )
 
     @property
     def host(self):
@@ -276,22 +287,37 @@ class Simulator:
         Returns:
             Predictions, [P, S, L, num_signals]; not finite where a simulation diverged.
         """
-        num_state = start.shape[2]
-        widest = next((w for w in BATCH_SIZES if w >= num_state + 3), BATCH_SIZES[-1])
-        parts = [
-            self._predict_part(theta[i : i + widest], start[i : i + widest], segments)
-            for i in range(0, len(theta), widest)
-        ]
-        return np.concatenate(parts)
+        at_once = np.all((theta == self.base)[:, self._looks], axis=1) & self._any_at_once
+        result = np.empty((len(theta), *segments.measured.shape))
+        for run, chosen in ((self._run_at_once, at_once), (self._run, ~at_once)):
+            rows = np.flatnonzero(chosen)
+            widest = next((w for w in BATCH_SIZES if w >= len(rows)), BATCH_SIZES[-1])
+            for part in np.split(rows, range(widest, len(rows), widest)):
+                result[part] = self._predict_part(run, theta[part], start[part], segments)
+        return result
 
-    def _predict_part(self, theta, start, segments: Segments) -> np.ndarray:
+    def _predict_part(self, run, theta, start, segments: Segments) -> np.ndarray:
         """Predict at most the widest batch, padded to a width that is compiled once."""
         num = len(theta)
+        if not num:
+            return np.empty((0, *segments.measured.shape))
         width = next(w for w in BATCH_SIZES if w >= num)
         repeat = np.minimum(np.arange(width), num - 1)
         with jax.enable_x64(True):
-            result = self._run(theta[repeat], start[repeat], segments.ctrl, segments.place)
+            result = run(theta[repeat], start[repeat], segments.ctrl, segments.place)
             return np.asarray(result)[:num, ..., : segments.measured.shape[2]]
+
+    def _predict_at_once(self, theta, start, ctrl, place):
+        """Do as `_predict` without the effects that look at the state."""
+        own = self._world.effects[: self._num_own]
+        candidates = self.with_parameters(theta)
+        world = self._world.replace(effects=own + tuple(candidates[i] for i in self._blind))
+        num_position = self.host.nq
+        state = dynamics.initial_state(world, start[:num_position], start[num_position:])
+        path = dynamics.trajectory(world, state, ctrl, self._substeps, self._warm_up)
+        path = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, path)
+        sensed = jax.vmap(dynamics.sensed, (None, 0))(world, path)
+        return self._at_samples(jnp.concatenate([sensed.qpos, sensed.qvel], axis=1), place)
 
     def _predict(self, theta, start, ctrl, place):
         """Predict what the sensors report of one segment, [L, nq + nv].
@@ -324,6 +350,10 @@ class Simulator:
 
         _, path = jax.lax.scan(advance, state, (jnp.arange(len(ctrl)), ctrl))
         path = jnp.concatenate([reported(state)[None], path[self._warm_up :]])
+        return self._at_samples(path, place)
+
+    def _at_samples(self, path, place):
+        """Interpolate a path on the grid [steps + 1, nq + nv] at the samples."""
         if self._on_grid:
             return path
         below = jnp.minimum(place.astype(int), len(path) - 2)

@@ -138,6 +138,8 @@ class Effect(abc.ABC):
     """Whether `apply` reads the physics state, which costs an engine call per substep."""
     senses: ClassVar[bool] = False
     """Whether `sense` does anything: the effect is one of sensors, not of the motion."""
+    notes: ClassVar[bool] = False
+    """Whether `note` does anything: what is reported depends on states of some time ago."""
     independent: ClassVar[bool] = False
     """Whether every parameter acts alone; otherwise the first one switches the others on."""
 

@@ -97,6 +97,7 @@ class SensorDelay(Effect):
     law: ClassVar[str] = "q_sensed(t) = q(t − d), q̇_sensed(t) = q̇(t − d)"
     identified_by: ClassVar[str] = "step trains in the command, and a second sensor"
     senses: ClassVar[bool] = True
+    notes: ClassVar[bool] = True
 
     delay: jax.Array = parameter(
         0.0,

@@ -78,7 +78,10 @@ CASES = {
             PENDULUM, "encoder_scale", {"scale": 1.1}, report=lambda states: 1.1 * states,
         ),
         Case(
-            PENDULUM, "encoder_offset", {"offset": 0.2}, report=lambda states: states + np.array([0.2, 0.0]),
+            PENDULUM,
+            "encoder_offset",
+            {"offset": 0.2},
+            report=lambda states: states + np.array([0.2, 0.0]),
         ),
         Case(PENDULUM, "sensor_delay", {"delay": 0.015}, late=0.015),
         Case(SLIDER, "contact_friction", {"sliding": 0.35}, slippery, target="geom/ball"),
