@@ -1,6 +1,9 @@
 """Pairs of a source and a target world: Desai et al. 2020, table of modified environments."""
 
+import numpy as np
+
 from garat_jax.dynamics import Override
+from garat_jax.envs.ant import Ant
 from garat_jax.envs.half_cheetah import HalfCheetah
 from garat_jax.envs.hopper import Hopper
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
@@ -58,5 +61,12 @@ PAIRS: dict[str, Pair] = {
         task=Walker2d(),
         source=(Override("body", "torso", "mass", 3.534),),
         target=(Override("body", "torso", "mass", 10.0),),
+    ),
+    "ant": Pair(
+        name="ant",
+        summary="Ant under a gravity of 9.81 m/s² instead of 4.91 m/s²",
+        task=Ant(),
+        source=(Override("option", "", "gravity", np.asarray([0.0, 0.0, -4.91])),),
+        target=(Override("option", "", "gravity", np.asarray([0.0, 0.0, -9.81])),),
     ),
 }

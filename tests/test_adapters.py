@@ -1,17 +1,25 @@
-"""Brax's wrappers and training on our environments."""
+"""Brax's wrappers and training on our environments, and ours on Brax's."""
+
+import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.envs.inverted_pendulum import InvertedPendulum as BraxPendulum
 from brax.envs.wrappers import training as wrappers
 from brax.training import pmap
 from brax.training.agents.ppo import train as brax_ppo
 
-from garat_jax.adapters import brax_on_new_jax, to_brax
+from garat_jax.adapters import brax_on_new_jax, from_brax, to_brax
+from garat_jax.agents import trpo
 from garat_jax.env import EnvState, StepResult, make_world
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
+from garat_jax.errors import UserError
 from tests.probe_envs import Probe
+
+OLD_BRAX = pytest.mark.filterwarnings("ignore:Accessing .* directly from `Data` is deprecated")
+"""Brax 0.14.2 reads MJX's data as older versions had it."""
 
 
 class Counter(Probe):
@@ -134,3 +142,49 @@ def test_brax_ppo_learns_on_our_environment(engine):
     assert np.isfinite([before, after]).all()
     assert after > 2 * before
     assert after > 60
+
+
+@pytest.fixture(scope="module")
+def braxs():
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Brax System, piplines and environments are not")
+        return BraxPendulum(backend="generalized")
+
+
+@OLD_BRAX
+def test_a_brax_environment_steps_as_it_does_in_brax(braxs):
+    env = from_brax(braxs, episode_length=3)
+    assert (env.obs_size, env.action_size) == (4, 1)
+    key, action = jax.random.key(0), jnp.asarray([0.02])
+    ours, theirs = jax.jit(env.reset)(None, key), jax.jit(braxs.reset)(jax.random.key_data(key))
+    our_step, their_step = jax.jit(env.step), jax.jit(braxs.step)
+    for count in range(1, 4):
+        result = our_step(None, ours, action, key)
+        ours, theirs = result.state, their_step(theirs, action)
+        np.testing.assert_array_equal(ours.obs, theirs.obs)
+        assert result.reward == theirs.reward
+        assert (bool(result.terminated), bool(result.truncated)) == (False, count == 3)
+    tilted = theirs.replace(pipeline_state=theirs.pipeline_state.replace(q=jnp.asarray([0.0, 0.5])))
+    result = our_step(None, ours._replace(physics=tilted), 100 * action, key)
+    assert (bool(result.terminated), bool(result.truncated)) == (True, False)
+
+
+@OLD_BRAX
+def test_trpo_learns_on_a_brax_environment(braxs):
+    env = from_brax(braxs, episode_length=100)
+    agent = trpo.make(env, trpo.TRPOConfig(num_envs=32, num_steps=64))
+
+    def iteration(state, _):
+        state, _, transitions = agent.step(state, None)
+        return state, transitions.terminated.mean()
+
+    def run(key):
+        return jax.lax.scan(iteration, agent.init(key, None), length=12)[1]
+
+    failures = np.asarray(jax.jit(run)(jax.random.key(0)))
+    assert failures[-1] < 0.5 * failures[0]
+
+
+def test_wrapped_brax_environments_are_refused(braxs):
+    with pytest.raises(UserError, match="EpisodeWrapper wraps"):
+        from_brax(wrappers.EpisodeWrapper(braxs, 10, 1), episode_length=10)

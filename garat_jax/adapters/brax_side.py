@@ -1,4 +1,4 @@
-"""Bridges to other libraries' environments: Brax's training runs on ours.
+"""Our environments as Brax's and Brax's as ours.
 
 Brax splits raw PRNG keys and steps actions in [-1, 1]; both stay on its side of the bridge.
 """
@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from garat_jax.env import Env
+from garat_jax.env import Env, EnvState, StepResult
+from garat_jax.errors import UserError
 from garat_jax.types import Params
 
 KEY = "key"
@@ -83,6 +84,55 @@ def to_brax(env: Env, params: Params) -> BraxEnv:
         params: Its parameters.
     """
     return BraxEnv(env, params)
+
+
+class BraxSource(Env):
+    """One of Brax's environments as ours; see `from_brax`.
+
+    Its states carry Brax's own in `physics`. There are no parameters.
+    """
+
+    def __init__(self, env: Any, episode_length: int):
+        self.env = env
+        self.episode_length = episode_length
+        self.obs_size = env.observation_size
+        self.action_low = np.full(env.action_size, -1.0, np.float32)
+        self.action_high = np.full(env.action_size, 1.0, np.float32)
+
+    def reset(self, params: Params, key: jax.Array) -> EnvState:
+        """Start an episode."""
+        del params
+        state = self.env.reset(jax.random.key_data(key))
+        return EnvState(state, state.obs, jnp.zeros((), jnp.int32))
+
+    def step(
+        self, params: Params, state: EnvState, action: jax.Array, key: jax.Array
+    ) -> StepResult:
+        """Take one control step; an observation that is not finite ends the episode."""
+        del params, key
+        after = self.env.step(_any(state.physics), self.clip(action))
+        steps = state.steps + 1
+        terminated = (after.done > 0) | ~jnp.isfinite(after.obs).all()
+        truncated = (steps >= self.episode_length) & ~terminated
+        return StepResult(EnvState(after, after.obs, steps), after.reward, terminated, truncated)
+
+
+def from_brax(env: Any, episode_length: int) -> BraxSource:
+    """Make one of Brax's or MuJoCo Playground's environments one of ours, with no parameters.
+
+    Args:
+        env: The environment itself, without Brax's training wrappers: those reset it before the
+            last observation is seen, and call a time limit an end.
+        episode_length: Control steps after which an episode is truncated.
+
+    Raises:
+        UserError: The environment is wrapped, or its observation is not one vector.
+    """
+    if isinstance(env, brax.envs.base.Wrapper):
+        raise UserError(f"{type(env).__name__} wraps the environment; give the one that is inside")
+    if not isinstance(env.observation_size, int):
+        raise UserError(f"observations must be one vector, not {env.observation_size}")
+    return BraxSource(env, episode_length)
 
 
 @contextlib.contextmanager

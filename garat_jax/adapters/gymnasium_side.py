@@ -1,0 +1,153 @@
+"""Our environments as Gymnasium's, one by one or as a vector."""
+
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from garat_jax.env import Env, EnvState
+from garat_jax.types import Params
+
+
+def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Return the spaces of observations and actions."""
+    observations = gymnasium.spaces.Box(-np.inf, np.inf, (env.obs_size,), np.float32)
+    low, high = (np.asarray(x, np.float32) for x in (env.action_low, env.action_high))
+    return observations, gymnasium.spaces.Box(low, high, dtype=np.float32)
+
+
+def _first_key(random: np.random.Generator) -> jax.Array:
+    return jax.random.key(int(random.integers(2**31)))
+
+
+def _start(env: Env, params: Params, key: jax.Array) -> tuple[EnvState, jax.Array]:
+    """Start an episode; return its state and the key that follows."""
+    reset_key, key = jax.random.split(key)
+    return env.reset(params, reset_key), key
+
+
+class GymnasiumEnv(gymnasium.Env):
+    """One of our environments as Gymnasium's; see `to_gymnasium`."""
+
+    def __init__(self, env: Env, params: Params):
+        self.metadata = {"render_modes": []}
+        self.render_mode = None
+        self.observation_space, self.action_space = _spaces(env)
+        self._params = params
+        self._state = self._key = None
+
+        def step(params: Params, state: EnvState, action: jax.Array, key: jax.Array):
+            step_key, key = jax.random.split(key)
+            return env.step(params, state, action, step_key), key
+
+        self._start = jax.jit(lambda params, key: _start(env, params, key))
+        self._step = jax.jit(step)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; a seed fixes this and all that follow. There are no options."""
+        super().reset(seed=seed)
+        if seed is not None or self._key is None:
+            self._key = _first_key(self.np_random)
+        self._state, self._key = self._start(self._params, self._key)
+        return np.asarray(self._state.obs, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Take one control step.
+
+        Raises:
+            ResetNeeded: The environment has not been reset yet.
+        """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("call reset before the first step")
+        action = np.asarray(action, np.float32)
+        result, self._key = self._step(self._params, self._state, action, self._key)
+        self._state = result.state
+        obs = np.asarray(result.state.obs, np.float32)
+        return obs, float(result.reward), bool(result.terminated), bool(result.truncated), {}
+
+
+class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
+    """A batch of our environments as Gymnasium's vector; see `to_gymnasium_vector`.
+
+    Each of them does what a `GymnasiumEnv` with its seed does.
+    """
+
+    def __init__(self, env: Env, params: Params, num_envs: int):
+        self.num_envs = num_envs
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.render_mode = None
+        self.single_observation_space, self.single_action_space = _spaces(env)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._params = params
+        self._states = self._keys = None
+
+        def step(params: Params, state: EnvState, action: jax.Array, key: jax.Array):
+            step_key, key = jax.random.split(key)
+            result = env.step(params, state, action, step_key)
+            fresh = _start(env, params, key)
+            done = result.terminated | result.truncated
+            state, key = jax.tree.map(
+                lambda new, old: jnp.where(done, new, old), fresh, (result.state, key)
+            )
+            return result, state, key
+
+        self._start = jax.jit(jax.vmap(lambda params, key: _start(env, params, key), (None, 0)))
+        self._step = jax.jit(jax.vmap(step, (None, 0, 0, 0)))
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode in each; a seed is that of the first, the others count up from it.
+
+        Raises:
+            ValueError: There is another number of seeds than of environments, or options are given.
+        """
+        if options:
+            raise ValueError(f"there are no options, not {', '.join(options)}")
+        seeds = [seed] * self.num_envs if seed is None else seed
+        if isinstance(seeds, int):
+            seeds = [seeds + i for i in range(self.num_envs)]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments")
+        if self._keys is None or any(seed is not None for seed in seeds):
+            randoms = [seeding.np_random(seed)[0] for seed in seeds]
+            self._keys = jnp.stack([_first_key(random) for random in randoms])
+        self._states, self._keys = self._start(self._params, self._keys)
+        return np.asarray(self._states.obs, np.float32), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Take one control step in each, and reset those whose episode ended.
+
+        Raises:
+            ResetNeeded: The environments have not been reset yet.
+        """
+        if self._states is None:
+            raise gymnasium.error.ResetNeeded("call reset before the first step")
+        actions = np.asarray(actions, np.float32)
+        result, self._states, self._keys = self._step(
+            self._params, self._states, actions, self._keys
+        )
+        terminated, truncated = np.asarray(result.terminated), np.asarray(result.truncated)
+        infos = _final(np.asarray(result.state.obs, np.float32), terminated | truncated)
+        obs = np.asarray(self._states.obs, np.float32)
+        return obs, np.asarray(result.reward, np.float64), terminated, truncated, infos
+
+
+def _final(obs: np.ndarray, done: np.ndarray) -> dict[str, Any]:
+    """Return the infos that tell of ended episodes; empty where none ended."""
+    if not done.any():
+        return {}
+    final_obs = np.full(len(done), None, dtype=object)
+    for i in np.flatnonzero(done):
+        final_obs[i] = obs[i]
+    return {"final_obs": final_obs, "_final_obs": done, "final_info": {}, "_final_info": done}
