@@ -163,7 +163,8 @@ def _sequence(sysid, spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path):
         path.stem,
         state,
         sysid.TimeSeries(step * np.arange(len(held)), held),
-        sysid.TimeSeries.from_names(rows["time"][1:], measured[1:], model),
+        # mj_step's sensors are those of the step's beginning, stamped with its end.
+        sysid.TimeSeries.from_names(rows["time"][1:-1] + step, measured[1:-1], model),
     )
 
 
