@@ -1,20 +1,43 @@
 """The catalogue of physical effects."""
 
-from garat_jax.effects.actuator import ActuatorDelay, MotorGain
+from garat_jax.effects.actuator import BackEmf, MotorCurve, MotorGain, TorqueSaturation
 from garat_jax.effects.base import Effect, ModelView, Parameter, parameter, unit_at
 from garat_jax.effects.body import AirDrag, ComOffset, PayloadMass
+from garat_jax.effects.command import ActuatorDelay, ActuatorLag, MotorDeadband
 from garat_jax.effects.contact import ContactCompliance, ContactFriction
-from garat_jax.effects.joint import CoulombFriction, RotorInertia, TorqueOffset, ViscousDamping
+from garat_jax.effects.friction import (
+    AsymmetricFriction,
+    CoulombFriction,
+    LoadFriction,
+    QuadraticDrag,
+    StribeckFriction,
+    ViscousDamping,
+)
+from garat_jax.effects.joint import CoggingTorque, JointStiffness, RotorInertia, TorqueOffset
 from garat_jax.effects.sensor import EncoderOffset, EncoderScale, SensorDelay
+from garat_jax.effects.transmission import Backlash, JointFlexibility
 from garat_jax.effects.world import GravityScale, GravityTilt
 
 CATALOGUE: dict[str, type[Effect]] = {
+    "motor_deadband": MotorDeadband,
+    "actuator_lag": ActuatorLag,
+    "actuator_delay": ActuatorDelay,
+    "motor_curve": MotorCurve,
+    "motor_gain": MotorGain,
+    "back_emf": BackEmf,
+    "torque_saturation": TorqueSaturation,
     "viscous_damping": ViscousDamping,
     "coulomb_friction": CoulombFriction,
+    "asymmetric_friction": AsymmetricFriction,
+    "stribeck_friction": StribeckFriction,
+    "load_friction": LoadFriction,
+    "quadratic_drag": QuadraticDrag,
+    "joint_stiffness": JointStiffness,
     "torque_offset": TorqueOffset,
+    "cogging_torque": CoggingTorque,
     "rotor_inertia": RotorInertia,
-    "motor_gain": MotorGain,
-    "actuator_delay": ActuatorDelay,
+    "backlash": Backlash,
+    "joint_flexibility": JointFlexibility,
     "payload_mass": PayloadMass,
     "com_offset": ComOffset,
     "air_drag": AirDrag,
@@ -26,11 +49,17 @@ CATALOGUE: dict[str, type[Effect]] = {
     "encoder_offset": EncoderOffset,
     "sensor_delay": SensorDelay,
 }
+"""Every kind by its name, in the order in which a command passes: laws see what came before."""
 
 __all__ = [
     "CATALOGUE",
     "ActuatorDelay",
+    "ActuatorLag",
     "AirDrag",
+    "AsymmetricFriction",
+    "BackEmf",
+    "Backlash",
+    "CoggingTorque",
     "ComOffset",
     "ContactCompliance",
     "ContactFriction",
@@ -40,13 +69,21 @@ __all__ = [
     "EncoderScale",
     "GravityScale",
     "GravityTilt",
+    "JointFlexibility",
+    "JointStiffness",
+    "LoadFriction",
     "ModelView",
+    "MotorCurve",
+    "MotorDeadband",
     "MotorGain",
     "Parameter",
     "PayloadMass",
+    "QuadraticDrag",
     "RotorInertia",
     "SensorDelay",
+    "StribeckFriction",
     "TorqueOffset",
+    "TorqueSaturation",
     "ViscousDamping",
     "parameter",
     "unit_at",

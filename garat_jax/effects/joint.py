@@ -1,77 +1,17 @@
-"""Effects at a joint: friction, rotor inertia, constant torque."""
+"""Effects at a joint beside friction: inertia, constant torque, spring, cogging."""
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from flax import struct
 
+from garat_jax.effects.actuator import can_bias, make_affine
+from garat_jax.effects.at_joint import at_dof
 from garat_jax.effects.base import Effect, ModelView, element_id, parameter
-
-SMALLEST_FRICTION = 1e-9
-"""Friction loss [N m] that makes MuJoCo reserve a constraint row without being felt."""
-
-
-@struct.dataclass
-class ViscousDamping(Effect):
-    """Torque against the motion, in proportion to the speed: tau = -coefficient * qvel.
-
-    Shows as an oscillation whose amplitude decays exponentially. Typical: 1e-4 N m s/rad for a ball
-    bearing, 0.01 to 1 for a geared robot joint (MuJoCo Menagerie's arms have 0.1 to 10).
-    """
-
-    kind: ClassVar[str] = "viscous_damping"
-    elements: ClassVar[tuple[str, ...]] = ("joint",)
-    law: ClassVar[str] = "τ = −c·q̇"
-    identified_by: ClassVar[str] = "free decay at several amplitudes; constant-speed runs"
-
-    coefficient: jax.Array = parameter(
-        0.0,
-        unit="N m s/rad",
-        low=0.0,
-        high=100.0,
-        scale=1e-3,
-        source="MuJoCo Menagerie: joint damping of published robots is at most 100",
-    )
-
-    def fields(self, model: ModelView) -> dict[str, jax.Array]:
-        """Add to the joint's native damping."""
-        dofs = model.dofs(self.name)
-        return {"dof_damping": model["dof_damping"].at[dofs].add(self.coefficient)}
-
-
-@struct.dataclass
-class CoulombFriction(Effect):
-    """Torque against the motion whatever the speed: |tau| <= torque.
-
-    Shows as an oscillation whose amplitude decays by the same step each swing and that stops
-    away from equilibrium. Typical: 1 to 10 % of a geared actuator's rated torque.
-    """
-
-    kind: ClassVar[str] = "coulomb_friction"
-    elements: ClassVar[tuple[str, ...]] = ("joint",)
-    law: ClassVar[str] = "|τ| ≤ τ_c, against the motion (MuJoCo's frictionloss)"
-    identified_by: ClassVar[str] = "slow motion with reversals; the last swings of a free decay"
-
-    torque: jax.Array = parameter(
-        0.0,
-        unit="N m",
-        low=0.0,
-        high=50.0,
-        scale=1e-3,
-        source="MuJoCo Menagerie: frictionloss of published robots is at most a few tens",
-    )
-
-    def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Make the compiler reserve the friction constraint's row."""
-        joint = spec.joint(self.name)
-        joint.frictionloss = max(joint.frictionloss, SMALLEST_FRICTION)
-
-    def fields(self, model: ModelView) -> dict[str, jax.Array]:
-        """Add to the joint's native friction loss."""
-        dofs = model.dofs(self.name)
-        return {"dof_frictionloss": model["dof_frictionloss"].at[dofs].add(self.torque)}
 
 
 @struct.dataclass
@@ -101,6 +41,11 @@ class RotorInertia(Effect):
         dofs = model.dofs(self.name)
         return {"dof_armature": model["dof_armature"].at[dofs].add(self.inertia)}
 
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Add to the joint's armature."""
+        spec.joint(self.name).armature += float(self.inertia)
+        return ""
+
 
 @struct.dataclass
 class TorqueOffset(Effect):
@@ -126,6 +71,142 @@ class TorqueOffset(Effect):
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
         """Add the torque as a generalised force."""
-        force = jnp.zeros(model.host.nv, ctrl.dtype)
-        index = model.host.jnt_dofadr[element_id(model.host, "joint", self.name)]
-        return ctrl, force.at[index].set(self.torque), memory
+        joint = element_id(model.host, "joint", self.name)
+        return ctrl, at_dof(model.host, joint, self.torque, ctrl.dtype), memory
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Add to the bias of an unlimited actuator at the joint, if there is one."""
+        for actuator in spec.actuators:
+            at_joint = (
+                actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == self.name
+            )
+            if at_joint and can_bias(actuator):
+                make_affine(actuator)
+                actuator.biasprm[0] += float(self.torque) / actuator.gear[0]
+                return ""
+        return f"{self.target} has no unlimited actuator whose bias could be the constant torque"
+
+
+@struct.dataclass
+class JointStiffness(Effect):
+    """A spring at the joint that the model lacks: a cable, a hose, a counterbalance, a flexure.
+
+    Torque −k·(q − q_ref), where `reference` is the place on the joint's own scale (that of qpos)
+    at which this spring pulls nowhere. With a spring that the model has they are one linear
+    spring. Shows as a torque against position, and as an oscillation that is faster than the
+    model's. Typical: 0.01 to 10 N m/rad for cables and hoses at an arm's joints.
+    """
+
+    kind: ClassVar[str] = "joint_stiffness"
+    elements: ClassVar[tuple[str, ...]] = ("joint",)
+    needs: ClassVar[str] = "a hinge or slide joint whose own spring, if any, is linear"
+    law: ClassVar[str] = "τ = −k·(q − q_ref) (MuJoCo's stiffness and springref)"
+    identified_by: ClassVar[str] = "slow motion over the joint's whole range; rest poses"
+
+    stiffness: jax.Array = parameter(
+        0.0,
+        unit="N m/rad",
+        low=0.0,
+        high=1e4,
+        scale=1e-2,
+        source="MuJoCo Menagerie: joint springs of published robots are at most a few thousand",
+    )
+    reference: jax.Array = parameter(
+        0.0, unit="rad", low=-10.0, high=10.0, scale=0.1, source="Within a few turns of the joint"
+    )
+
+    @classmethod
+    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
+        """Say whether the joint is a hinge or slide whose own spring, if any, is linear."""
+        if not super().fits(host, element, name):
+            return False
+        return not np.any(host.jnt_stiffnesspoly[element_id(host, "joint", name)])
+
+    def fields(self, model: ModelView) -> dict[str, jax.Array]:
+        """Put both springs into one."""
+        joint = element_id(model.host, "joint", self.name)
+        place = model.host.jnt_qposadr[joint]
+        stiffness, reference = model["jnt_stiffness"], model["qpos_spring"]
+        total = stiffness[joint] + self.stiffness
+        pull = stiffness[joint] * reference[place] + self.stiffness * self.reference
+        changed = jnp.asarray(self.stiffness) != 0.0
+        middle = jnp.where(changed, pull / jnp.where(changed, total, 1.0), reference[place])
+        return {
+            "jnt_stiffness": stiffness.at[joint].set(total),
+            "qpos_spring": reference.at[place].set(middle),
+        }
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Put both springs into one."""
+        joint = spec.joint(self.name)
+        own, added = float(joint.stiffness[0]), float(self.stiffness)
+        if added:
+            degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+            reference = np.rad2deg(self.reference) if degrees else self.reference
+            pull = own * joint.springref + added * float(reference)
+            joint.springref = pull / (own + added)
+            joint.stiffness[0] = own + added
+        return ""
+
+
+@struct.dataclass
+class CoggingTorque(Effect):
+    """A torque that repeats with the angle: magnets against slots, gear teeth, a bent shaft.
+
+    τ = A·sin(n·q + φ) with n periods in a turn of the joint; it takes no energy over a turn.
+    Shows as ripple in slow motion that keeps its place when speed and direction change. Typical:
+    1 to 5 % of a motor's rated torque, n = slots × poles' least common multiple × gear ratio; 1 or
+    2 for eccentric gears (Holtz and Springob 1996).
+    """
+
+    kind: ClassVar[str] = "cogging_torque"
+    elements: ClassVar[tuple[str, ...]] = ("joint",)
+    needs: ClassVar[str] = "a hinge joint"
+    law: ClassVar[str] = "τ = A·sin(n·q + φ)"
+    identified_by: ClassVar[str] = "slow runs over several periods in both directions"
+    acts: ClassVar[bool] = True
+    reads_state: ClassVar[bool] = True
+
+    amplitude: jax.Array = parameter(
+        0.0,
+        unit="N m",
+        low=-50.0,
+        high=50.0,
+        scale=1e-2,
+        source="A few per cent of the torque of table-top and legged robots' joints, with room",
+    )
+    periods: jax.Array = parameter(
+        6.0,
+        unit="1/turn",
+        low=0.5,
+        high=500.0,
+        scale=0.05,
+        source="From an eccentric gear to 42 poles and slots behind a small gear",
+    )
+    phase: jax.Array = parameter(
+        0.0, unit="rad", low=-6.3, high=6.3, scale=0.1, source="A whole turn either way"
+    )
+
+    @classmethod
+    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
+        """Say whether the joint is a hinge: a slide has no turns."""
+        hinge = mujoco.mjtJoint.mjJNT_HINGE
+        return super().fits(host, element, name) and host.joint(name).type[0] == hinge
+
+    @classmethod
+    def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
+        """Try common numbers of periods, in phase and a quarter of a period late."""
+        del host, target
+        size = cls.parameters()[0].scale
+        return tuple(
+            {"amplitude": size, "periods": float(periods), "phase": phase}
+            for periods in (1, 2, 4, 6, 12, 24)
+            for phase in (0.0, np.pi / 2)
+        )
+
+    def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
+        """Add the torque at the present angle."""
+        joint = element_id(model.host, "joint", self.name)
+        angle = state.qpos[model.host.jnt_qposadr[joint]]
+        torque = self.amplitude * jnp.sin(self.periods * angle + self.phase)
+        return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory

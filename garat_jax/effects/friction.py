@@ -1,0 +1,382 @@
+"""Friction at a joint: laws of speed, direction and load.
+
+Dry friction is MuJoCo's constraint row (frictionloss), which holds at rest and is stable at any
+timestep. A row has one size in both directions and at all speeds within a control step, so a law
+that is weaker somewhere adds a force along the motion there. That force starts at rest from zero
+and grows no faster than half as steep as the row itself, so that both together take energy away
+at every speed.
+"""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from garat_jax.effects.at_joint import actuator_torque, at_dof, felt_inertia, is_driven
+from garat_jax.effects.base import Effect, ModelView, element_id, parameter
+
+SMALLEST_FRICTION = 1e-9
+"""Friction loss [N m] that makes MuJoCo reserve a constraint row without being felt."""
+SHARE_OF_ROW = 0.5
+"""Steepness of a force along the motion, relative to the friction row's own."""
+
+
+def reserve_row(spec: mujoco.MjSpec, joint: str) -> None:
+    """Make the compiler reserve a joint's friction constraint."""
+    element = spec.joint(joint)
+    element.frictionloss = max(element.frictionloss, SMALLEST_FRICTION)
+
+
+def row_steepness(model: ModelView, dof: int) -> jax.Array:
+    """Return the friction row's torque per speed near rest [N m s/rad], [].
+
+    From MuJoCo's documentation, "Solver parameters": the row's force is (b·v)/R with
+    R = (1 − d)/d·A, d = solimp[0] at zero, b = 2/(solimp[1]·timeconst), and A the inverse of the
+    inertia.
+    """
+    host = model.host
+    impedance, widest = (float(np.clip(host.dof_solimp[dof, i], 1e-4, 0.9999)) for i in (0, 1))
+    first, second = host.dof_solref[dof]
+    rate = 2.0 / max(float(first), 2.0 * host.opt.timestep) if first > 0 else -float(second)
+    return rate / widest * impedance / (1.0 - impedance) * felt_inertia(model, dof)
+
+
+def along_motion(model: ModelView, dof: int, speed: jax.Array, force: jax.Array) -> jax.Array:
+    """Return a force of a given size that is zero at rest and ramps up as a row allows, [].
+
+    Args:
+        model: The model as all effects leave it.
+        dof: The degree of freedom.
+        speed: Its speed, [].
+        force: Size of the force beyond the ramp, [].
+    """
+    most = SHARE_OF_ROW * row_steepness(model, dof) * jnp.abs(speed)
+    return jnp.clip(force, -most, most)
+
+
+def _dof(host: mujoco.MjModel, joint: str) -> int:
+    return int(host.jnt_dofadr[element_id(host, "joint", joint)])
+
+
+@struct.dataclass
+class ViscousDamping(Effect):
+    """Torque against the motion, in proportion to the speed: tau = -coefficient * qvel.
+
+    Shows as an oscillation whose amplitude decays exponentially. Typical: 1e-4 N m s/rad for a ball
+    bearing, 0.01 to 1 for a geared robot joint (MuJoCo Menagerie's arms have 0.1 to 10).
+    """
+
+    kind: ClassVar[str] = "viscous_damping"
+    elements: ClassVar[tuple[str, ...]] = ("joint",)
+    law: ClassVar[str] = "τ = −c·q̇"
+    identified_by: ClassVar[str] = "free decay at several amplitudes; constant-speed runs"
+
+    coefficient: jax.Array = parameter(
+        0.0,
+        unit="N m s/rad",
+        low=0.0,
+        high=100.0,
+        scale=1e-3,
+        source="MuJoCo Menagerie: joint damping of published robots is at most 100",
+    )
+
+    def fields(self, model: ModelView) -> dict[str, jax.Array]:
+        """Add to the joint's native damping."""
+        dofs = model.dofs(self.name)
+        return {"dof_damping": model["dof_damping"].at[dofs].add(self.coefficient)}
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Add to the joint's damping."""
+        spec.joint(self.name).damping[0] += float(self.coefficient)
+        return ""
+
+
+@struct.dataclass
+class CoulombFriction(Effect):
+    """Torque against the motion whatever the speed: |tau| <= torque.
+
+    Shows as an oscillation whose amplitude decays by the same step each swing and that stops
+    away from equilibrium. Typical: 1 to 10 % of a geared actuator's rated torque.
+    """
+
+    kind: ClassVar[str] = "coulomb_friction"
+    elements: ClassVar[tuple[str, ...]] = ("joint",)
+    law: ClassVar[str] = "|τ| ≤ τ_c, against the motion (MuJoCo's frictionloss)"
+    identified_by: ClassVar[str] = "slow motion with reversals; the last swings of a free decay"
+
+    torque: jax.Array = parameter(
+        0.0,
+        unit="N m",
+        low=0.0,
+        high=50.0,
+        scale=1e-3,
+        source="MuJoCo Menagerie: frictionloss of published robots is at most a few tens",
+    )
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Make the compiler reserve the friction constraint's row."""
+        reserve_row(spec, self.name)
+
+    def fields(self, model: ModelView) -> dict[str, jax.Array]:
+        """Add to the joint's native friction loss."""
+        dofs = model.dofs(self.name)
+        return {"dof_frictionloss": model["dof_frictionloss"].at[dofs].add(self.torque)}
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Add to the joint's friction loss."""
+        spec.joint(self.name).frictionloss += float(self.torque)
+        return ""
+
+
+@struct.dataclass
+class AsymmetricFriction(Effect):
+    """Dry and viscous friction that differ between the directions of motion.
+
+    τ = −(τ₊ + c₊·q̇) for q̇ > 0 and τ₋ − c₋·q̇ for q̇ < 0; at rest anything between −τ₊ and τ₋. The
+    mean of both directions is native (friction loss, damping), half of their difference is a force
+    that does not change sign with the speed. Shows as torque against speed that is not odd, which
+    a constant torque imitates at one speed. Typical: 10 to 30 % between the directions of worm and
+    harmonic drives and preloaded gears (Armstrong-Hélouvry, Dupont and Canudas de Wit 1994).
+    """
+
+    kind: ClassVar[str] = "asymmetric_friction"
+    elements: ClassVar[tuple[str, ...]] = ("joint",)
+    law: ClassVar[str] = "τ = −(τ₊ + c₊·q̇) for q̇ > 0, τ₋ − c₋·q̇ for q̇ < 0"
+    identified_by: ClassVar[str] = "constant-speed runs in both directions, and rests between them"
+    acts: ClassVar[bool] = True
+    reads_state: ClassVar[bool] = True
+
+    coulomb_positive: jax.Array = parameter(
+        0.0,
+        unit="N m",
+        low=0.0,
+        high=50.0,
+        scale=1e-3,
+        source="As coulomb_friction",
+    )
+    coulomb_negative: jax.Array = parameter(
+        0.0,
+        unit="N m",
+        low=0.0,
+        high=50.0,
+        scale=1e-3,
+        source="As coulomb_friction",
+    )
+    viscous_positive: jax.Array = parameter(
+        0.0,
+        unit="N m s/rad",
+        low=0.0,
+        high=100.0,
+        scale=1e-3,
+        source="As viscous_damping",
+    )
+    viscous_negative: jax.Array = parameter(
+        0.0,
+        unit="N m s/rad",
+        low=0.0,
+        high=100.0,
+        scale=1e-3,
+        source="As viscous_damping",
+    )
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Make the compiler reserve the friction constraint's row."""
+        reserve_row(spec, self.name)
+
+    def fields(self, model: ModelView) -> dict[str, jax.Array]:
+        """Add the mean of both directions to the joint's friction loss and damping."""
+        dof = _dof(model.host, self.name)
+        dry = 0.5 * (self.coulomb_positive + self.coulomb_negative)
+        viscous = 0.5 * (self.viscous_positive + self.viscous_negative)
+        return {
+            "dof_frictionloss": model["dof_frictionloss"].at[dof].add(dry),
+            "dof_damping": model["dof_damping"].at[dof].add(viscous),
+        }
+
+    def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
+        """Add half of the difference, which points the same way in both directions."""
+        joint = element_id(model.host, "joint", self.name)
+        dof = _dof(model.host, self.name)
+        speed = state.qvel[dof]
+        dry = 0.5 * (self.coulomb_negative - self.coulomb_positive)
+        viscous = 0.5 * (self.viscous_negative - self.viscous_positive)
+        torque = along_motion(model, dof, speed, dry) + viscous * jnp.abs(speed)
+        return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Write the mean of both directions."""
+        joint = spec.joint(self.name)
+        dry = float(self.coulomb_positive) + float(self.coulomb_negative)
+        viscous = float(self.viscous_positive) + float(self.viscous_negative)
+        joint.frictionloss += 0.5 * dry
+        joint.damping[0] += 0.5 * viscous
+        return f"MJCF has one friction for both directions; {self.target} has their mean"
+
+
+@struct.dataclass
+class StribeckFriction(Effect):
+    """Dry friction that is larger at rest than in motion.
+
+    |τ| = τ_c + (τ_s − τ_c)·exp(−(q̇/v_s)²), against the motion; `static` below `coulomb` counts as
+    equal to it. The friction row has the static size, which holds at rest; in motion a force along
+    it takes away what friction loses. That force is bounded near rest (see the module), so
+    a v_s below 2·(τ_s − τ_c)/k, with the row's steepness k, is felt as that speed. Shows as
+    stick-slip in slow motion and a jump at breakaway. Typical: τ_s = 1.2 to 2 τ_c and v_s = 0.01 to
+    0.1 rad/s (Armstrong-Hélouvry, Dupont and Canudas de Wit 1994).
+    """
+
+    kind: ClassVar[str] = "stribeck_friction"
+    elements: ClassVar[tuple[str, ...]] = ("joint",)
+    law: ClassVar[str] = "|τ| = τ_c + (τ_s − τ_c)·exp(−(q̇/v_s)²), against the motion"
+    identified_by: ClassVar[str] = "constant-speed runs from below v_s up; slow ramps from rest"
+    acts: ClassVar[bool] = True
+    reads_state: ClassVar[bool] = True
+
+    coulomb: jax.Array = parameter(
+        0.0, unit="N m", low=0.0, high=50.0, scale=1e-3, source="As coulomb_friction"
+    )
+    static: jax.Array = parameter(
+        0.0,
+        unit="N m",
+        low=0.0,
+        high=100.0,
+        scale=2e-3,
+        source="Twice coulomb_friction (Armstrong-Hélouvry et al. 1994: ratios of 1 to 2)",
+    )
+    velocity: jax.Array = parameter(
+        0.05,
+        unit="rad/s",
+        low=1e-3,
+        high=10.0,
+        scale=0.01,
+        source="Armstrong-Hélouvry et al. 1994, from boundary to full fluid lubrication, with room",
+    )
+
+    @classmethod
+    def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
+        """Try a peak at several speeds: it is felt only below them."""
+        del host, target
+        size = cls.parameters()[0].scale
+        return tuple(
+            {"coulomb": size, "static": 2.0 * size, "velocity": speed} for speed in (0.02, 0.1, 0.5)
+        )
+
+    @property
+    def excess(self) -> jax.Array:
+        """Static beyond Coulomb friction, N m, []."""
+        return jnp.maximum(jnp.asarray(self.static) - self.coulomb, 0.0)
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Make the compiler reserve the friction constraint's row."""
+        reserve_row(spec, self.name)
+
+    def fields(self, model: ModelView) -> dict[str, jax.Array]:
+        """Add the friction at rest to the joint's friction loss."""
+        dof = _dof(model.host, self.name)
+        at_rest = self.coulomb + self.excess
+        return {"dof_frictionloss": model["dof_frictionloss"].at[dof].add(at_rest)}
+
+    def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
+        """Take away in motion what friction loses with speed."""
+        joint = element_id(model.host, "joint", self.name)
+        dof = _dof(model.host, self.name)
+        speed = state.qvel[dof]
+        lost = -self.excess * jnp.expm1(-((speed / self.velocity) ** 2)) * jnp.sign(speed)
+        torque = along_motion(model, dof, speed, lost)
+        return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Write the friction in motion."""
+        spec.joint(self.name).frictionloss += float(self.coulomb)
+        return f"MJCF has no peak of friction at rest; {self.target} has its Coulomb friction"
+
+
+@struct.dataclass
+class LoadFriction(Effect):
+    """Dry friction in proportion to the torque that the joint's actuators transmit.
+
+    |τ| ≤ μ·|τ_a|, against the motion, with τ_a the actuators' torque at the joint as the model has
+    it. A gear gives (1 − μ) of the torque when it drives and (1 + μ) when it is driven back. Near
+    rest the law is linear in speed, as steep as is stable: half of inertia I over timestep h; under
+    a torque τ that it could hold a joint creeps at 2·h·τ/I (0.04 rad/s for 10 rad/s² at 2 ms).
+    Commands are seen as the effects listed before this one leave them. Shows as friction that grows
+    with load, at every speed. Typical: 1 minus a gear's efficiency: 0.02 for spur gears, 0.1 to 0.3
+    for harmonic drives, above 0.5 for worm gears; Duclusaud et al. 2024 (arXiv 2410.08650) have the
+    law among their friction models of servos.
+    """
+
+    kind: ClassVar[str] = "load_friction"
+    elements: ClassVar[tuple[str, ...]] = ("joint",)
+    needs: ClassVar[str] = "a joint whose actuators are motors or servos without dynamics"
+    law: ClassVar[str] = "|τ| ≤ μ·|τ_a(u, q, q̇)|, against the motion"
+    identified_by: ClassVar[str] = "lifting and lowering the same load at several weights"
+    acts: ClassVar[bool] = True
+    reads_state: ClassVar[bool] = True
+
+    ratio: jax.Array = parameter(
+        0.0,
+        unit="1",
+        low=0.0,
+        high=2.0,
+        scale=0.02,
+        source="At 1 a gear is self-locking; worm gears may exceed it",
+    )
+
+    @classmethod
+    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
+        """Say whether the joint has actuators, of kinds whose torque is known."""
+        return super().fits(host, element, name) and is_driven(host, name)
+
+    def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
+        """Add the friction under the present torque."""
+        host = model.host
+        joint, dof = element_id(host, "joint", self.name), _dof(host, self.name)
+        angle, speed = state.qpos[host.jnt_qposadr[joint]], state.qvel[dof]
+        size = self.ratio * jnp.abs(actuator_torque(model, joint, angle, speed, ctrl))
+        steepness = 0.5 * felt_inertia(model, dof) / host.opt.timestep
+        torque = -jnp.clip(steepness * speed, -size, size)
+        return ctrl, at_dof(host, joint, torque, ctrl.dtype), memory
+
+
+@struct.dataclass
+class QuadraticDrag(Effect):
+    """Torque against the motion with the square of the speed: a paddle, a fan, churned oil.
+
+    τ = −c·|q̇|·q̇. It is taken semi-implicitly, −c·|q̇|·q̇/(1 + h·c·|q̇|/I) with the inertia I that is
+    felt at the joint, which cannot overshoot. Shows as a decay that is fast at large and slow at
+    small amplitudes. Typical: 1e-4 to 0.1 N m s²/rad² for a plate of some cm² to dm² at 0.5 m.
+    """
+
+    kind: ClassVar[str] = "quadratic_drag"
+    elements: ClassVar[tuple[str, ...]] = ("joint",)
+    law: ClassVar[str] = "τ = −c·|q̇|·q̇"
+    identified_by: ClassVar[str] = "free decay and constant-speed runs at two speeds or more"
+    acts: ClassVar[bool] = True
+    reads_state: ClassVar[bool] = True
+
+    coefficient: jax.Array = parameter(
+        0.0,
+        unit="N m s²/rad²",
+        low=0.0,
+        high=10.0,
+        scale=1e-3,
+        source="½·ρ·c_w·A·r³: air and a plate of 1 m² at 2 m give about 10",
+    )
+
+    def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
+        """Add the drag at the present speed."""
+        joint, dof = element_id(model.host, "joint", self.name), _dof(model.host, self.name)
+        speed = state.qvel[dof]
+        slope = self.coefficient * jnp.abs(speed)
+        stopping = model.host.opt.timestep * slope / felt_inertia(model, dof)
+        torque = -slope * speed / (1.0 + stopping)
+        return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Write it as the second coefficient of the joint's polynomial damping."""
+        spec.joint(self.name).damping[1] += float(self.coefficient)
+        return ""

@@ -1,0 +1,132 @@
+"""Actuator laws against closed forms, and limits that survive."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from garat_jax import dynamics
+from garat_jax.effects import (
+    ActuatorLag,
+    BackEmf,
+    Effect,
+    JointStiffness,
+    MotorCurve,
+    MotorDeadband,
+    MotorGain,
+    TorqueSaturation,
+)
+from garat_jax.effects.actuator import MINITAUR_CURVE
+from garat_jax.errors import UserError
+from tests.effects.truth import RIG, SERVO
+from tests.models import spec
+
+MOTOR = "actuator/motor"
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def torques(mjcf: str, effects: tuple[Effect, ...], ctrl, angle=0.0, speed=0.0) -> np.ndarray:
+    """Return the actuator's torque at the joint for each command, from C MuJoCo, N m."""
+    world = dynamics.compile(spec(mjcf), effects=effects, engine="mujoco")
+    view, model = dynamics.view(world), dynamics.native_model(world)
+    data = mujoco.MjData(model)
+    found = []
+    for command in ctrl:
+        acting = jnp.asarray([command])
+        for effect in world.effects:
+            acting = effect.apply(view, None, acting, effect.init(model))[0]
+        data.qpos[0], data.qvel[0], data.ctrl[:] = angle, speed, np.asarray(acting)
+        mujoco.mj_forward(model, data)
+        found.append(data.qfrc_actuator[0])
+    return np.asarray(found)
+
+
+def test_the_minitaur_table_is_reproduced():
+    wide = RIG.replace("-3 3", "-9 9")
+    linear, given = np.transpose(MINITAUR_CURVE)
+    both = np.concatenate([linear, -linear]) / 2.0  # gear 2
+    got = torques(wide, (MotorCurve(MOTOR, table=MINITAUR_CURVE),), both)
+    np.testing.assert_allclose(got, np.concatenate([given, -given]), atol=1e-12)
+    np.testing.assert_allclose(linear, np.arange(0, 61, 10) * 0.1)
+
+
+def test_two_numbers_come_near_the_minitaur_table():
+    linear, given = np.transpose(MINITAUR_CURVE)
+    effect = MotorCurve(MOTOR, saturation=4.0, linear=0.9)
+    got = torques(RIG.replace("-3 3", "-9 9"), (effect,), linear / 2.0)
+    np.testing.assert_allclose(got, given, atol=0.05 * given.max())
+
+
+def test_a_curve_is_straight_then_level():
+    effect = MotorCurve(MOTOR, saturation=2.0, linear=1.0)
+    got = torques(RIG, (effect,), [0.2, 0.5, -0.5, 3.0, 30.0])
+    np.testing.assert_allclose(got[:3], [0.4, 1.0, -1.0])
+    assert got[3] == pytest.approx(2.0, abs=0.01)
+    assert got[4] == got[3]  # the command was clamped first
+
+
+def test_a_limit_is_at_the_joint_and_the_tighter_one_holds():
+    tight = RIG.replace('gear="2"', 'gear="2" forcerange="-0.2 0.6"')
+    commands = [-3.0, -0.1, 0.1, 3.0]
+    for mjcf, expected in ((RIG, [-0.7, -0.2, 0.2, 0.7]), (tight, [-0.4, -0.2, 0.2, 0.7])):
+        got = torques(mjcf, (TorqueSaturation(MOTOR, limit=0.7),), commands)
+        np.testing.assert_allclose(got, expected)
+
+
+def test_a_gain_moves_the_limit_with_it():
+    limited = RIG.replace('gear="2"', 'gear="2" forcerange="-0.2 0.6"')
+    got = torques(limited, (MotorGain(MOTOR, scale=0.5),), [-3.0, 0.1, 3.0])
+    np.testing.assert_allclose(got, [-0.2, 0.1, 0.6])
+
+
+@pytest.mark.parametrize("mjcf", [RIG, SERVO], ids=["motor", "servo"])
+def test_back_emf_is_in_joint_units_and_adds_to_a_servo(mjcf):
+    plain, with_emf = (
+        torques(mjcf, effects, [0.5], 0.1, 2.0) for effects in ((), (BackEmf(MOTOR, 0.3),))
+    )
+    np.testing.assert_allclose(with_emf - plain, -0.6)
+
+
+def test_a_lag_is_the_mean_of_the_exact_solution():
+    world = dynamics.compile(spec(RIG), effects=(ActuatorLag("all", 0.01),), engine="mujoco")
+    effect, view = world.effects[0], dynamics.view(world)
+    memory, acting = effect.init(world.host.model), []
+    for command in (1.0, 2.0, 2.0, 2.0):
+        ctrl, _, memory = effect.apply(view, None, jnp.asarray([command]), memory)
+        acting.append(float(ctrl[0]))
+    fine = np.linspace(0.0, 0.006, 6001)
+    exact = 2.0 - np.exp(-fine / 0.01)
+    means = [exact[i : i + 2001].mean() for i in (0, 2000, 4000)]
+    np.testing.assert_allclose(acting, [1.0, *means], atol=1e-5)
+
+
+def test_springs_add_up_to_one():
+    own = RIG.replace('armature="0.01"', 'armature="0.01" stiffness="2" springref="30"')
+    effect = JointStiffness("joint/hinge", stiffness=3.0, reference=-0.4)
+    model = dynamics.native_model(dynamics.compile(spec(own), effects=(effect,), engine="mujoco"))
+    data = mujoco.MjData(model)
+    for angle in (-1.0, 0.2):
+        data.qpos[0] = angle
+        mujoco.mj_forward(model, data)
+        expected = -2.0 * (angle - np.pi / 6) - 3.0 * (angle + 0.4)
+        np.testing.assert_allclose(data.qfrc_spring, expected)
+
+
+@pytest.mark.parametrize("effect", [MotorDeadband(MOTOR, 0.1), MotorCurve(MOTOR, 1.0)])
+def test_laws_of_motors_are_refused_at_servos(effect):
+    with pytest.raises(UserError, match="force is its gain times the command"):
+        dynamics.compile(spec(SERVO), effects=(effect,))
+
+
+def test_laws_with_a_threshold_start_within_the_range_of_the_model():
+    host = spec(RIG).compile()
+    limits = [start["limit"] for start in TorqueSaturation.starts(host, MOTOR)]
+    assert max(limits) < 6.0  # gear 2, commands up to 3
+    assert len(limits) > 2
+    assert all(0 < s["width"] < 3.0 for s in MotorDeadband.starts(host, MOTOR))

@@ -1,0 +1,110 @@
+"""A motor apart from its joint, against a MuJoCo model that has it as a second body."""
+
+import jax
+import numpy as np
+import pytest
+
+from garat_jax import dynamics
+from garat_jax.effects import Backlash, JointFlexibility
+from garat_jax.errors import UserError
+from tests.effects.truth import RIG, SERVO, Truth, commands, predict, record
+from tests.models import PENDULUM, spec
+
+TWO_BODIES = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.002"/>
+  <worldbody><body name="rotor" pos="0 0 1">
+    <joint name="rotor" axis="0 1 0" armature="0.01"/>
+    <inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>
+    <body name="pole">
+      <joint name="gear" axis="0 1 0" {gear}/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.6"
+            contype="0" conaffinity="0"/>
+    </body></body></worldbody>
+  <actuator>{actuator}</actuator>
+</mujoco>
+"""
+MOTOR = '<motor joint="rotor" gear="2" ctrlrange="-3 3"/>'
+POSITION = '<position joint="rotor" kp="20" kv="1" ctrlrange="-3 3"/>'
+UNDAMPED = {
+    "motor": RIG.replace(' damping="0.01"', ""),
+    "servo": SERVO.replace(' damping="0.01"', ""),
+}
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def compare(effect, gear: str, drive: str, mjcf: str | None = None) -> tuple[float, float]:
+    """Return the angle's error [rad] with the effect, and without it."""
+    actuator = {"motor": MOTOR, "servo": POSITION}[drive]
+    ctrl = commands(0.5)
+    true = record(TWO_BODIES.format(gear=gear, actuator=actuator), Truth(), ctrl)
+    mjcf = mjcf or UNDAMPED[drive]
+    return tuple(
+        float(np.sqrt(np.mean((predict(mjcf, effects, ctrl) - true)[:, 0] ** 2)))
+        for effects in ((effect,), ())
+    )
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize(("drive", "stiffness"), [("motor", 2.0), ("servo", 10.0), ("servo", 50.0)])
+def test_a_flexible_joint_is_two_bodies_with_a_spring(drive, stiffness, integrator):
+    effect = JointFlexibility("joint/hinge", stiffness=stiffness, damping=0.02)
+    mjcf = UNDAMPED[drive].replace("/>", f' integrator="{integrator}"/>', 1)
+    gear = f'stiffness="{stiffness}" damping="0.02"'
+    error, without = compare(effect, gear, drive, mjcf)
+    assert error < 3.5e-3
+    assert without > 6 * error
+
+
+@pytest.mark.parametrize(("drive", "gap"), [("motor", 0.1), ("servo", 0.02), ("servo", 0.1)])
+def test_backlash_is_two_bodies_with_play(drive, gap):
+    gear = f'limited="true" range="{-gap / 2} {gap / 2}" solreflimit="0.0005 1"'
+    error, without = compare(Backlash("joint/hinge", gap=gap), gear, drive)
+    assert error < 3.5e-3
+    assert without > 4 * error
+
+
+@pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e8])
+@pytest.mark.parametrize("drive", UNDAMPED)
+def test_a_stiff_gear_is_a_rigid_one_at_any_timestep(drive, stiffness):
+    mjcf = UNDAMPED[drive].replace("0.002", "0.005")
+    effect = JointFlexibility("joint/hinge", stiffness=stiffness)
+    rigid, stiff = (predict(mjcf, effects, commands(0.5)) for effects in ((), (effect,)))
+    np.testing.assert_allclose(stiff[:, 0], rigid[:, 0], atol=0.02)
+
+
+@pytest.mark.parametrize("armature", [1e-5, 1e-3, 1.0])
+@pytest.mark.parametrize("drive", UNDAMPED)
+def test_motors_of_any_size_stay_finite(drive, armature):
+    mjcf = UNDAMPED[drive].replace('armature="0.01"', f'armature="{armature}"')
+    for effect in (
+        Backlash("joint/hinge", gap=0.02),
+        JointFlexibility("joint/hinge", stiffness=20.0),
+    ):
+        path = predict(mjcf, (effect,), commands(0.5))
+        assert np.abs(path[:, 1]).max() < 50.0
+
+
+def test_the_motor_goes_where_its_joint_is_put():
+    effect = JointFlexibility("joint/hinge", stiffness=20.0)
+    world = dynamics.compile(spec(UNDAMPED["motor"]), effects=(effect,), engine="mujoco")
+    state = dynamics.initial_state(world, np.array([0.0]), np.array([8.0]))
+    state = dynamics.step(world, state, np.zeros(1), 5)
+    state = state._replace(qpos=np.array([0.5]), qvel=np.array([0.0]))
+    after = dynamics.step(world, state, np.zeros(1), 1)
+    assert np.abs(after.qvel - 0.0).max() < 0.2
+
+
+@pytest.mark.parametrize(
+    "mjcf", [PENDULUM, RIG.replace("/>", ' integrator="RK4"/>', 1)], ids=["no rotor", "RK4"]
+)
+def test_a_joint_without_a_motor_that_can_turn_is_refused(mjcf):
+    with pytest.raises(UserError, match=r"armature above 0.*other than RK4"):
+        dynamics.compile(spec(mjcf), effects=(Backlash("joint/hinge", gap=0.1),))
+    assert Backlash.targets(spec(mjcf).compile()) == []
