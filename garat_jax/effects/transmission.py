@@ -86,8 +86,8 @@ class Transmission(Effect, abc.ABC):
 
     elements: ClassVar[tuple[str, ...]] = ("joint",)
     needs: ClassVar[str] = (
-        "a joint with motors or servos without dynamics, an armature above 0 (the motor's inertia), "
-        "and an integrator other than RK4"
+        "a joint with motors or servos without dynamics, an armature above 0 (the motor's "
+        "inertia), and an integrator other than RK4"
     )
     acts: ClassVar[bool] = True
     reads_state: ClassVar[bool] = True

@@ -94,7 +94,7 @@ def test_card_elsewhere_is_refused(tmp_path):
         ('field = "mass"', 'feild = "mass"', "unknown key of an override 'feild'"),
         ("value = 1.3", "", "[[override]] lacks value"),
         ('"coulomb_friction"', '"coulomb"', "unknown effect 'coulomb'"),
-        ('"coulomb_friction"', '"coulomb_fricton"', "did you mean coulomb_friction?"),
+        ('"coulomb_friction"', '"coulomb_fricton"', "did you mean coulomb_friction"),
         ("joint/elbow", "joint/elbo", "unknown joint 'elbo'; did you mean elbow?"),
         ("joint/elbow", "body/forearm", "coulomb_friction acts on joint/NAME"),
         ("{ torque =", "{ torqe =", "unknown parameter of coulomb_friction 'torqe'"),
