@@ -3,8 +3,10 @@
 import re
 import subprocess
 import sys
+import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -38,3 +40,18 @@ def test_the_readmes_world_runs(capsys):
     (snippet,) = (text for text in SNIPPETS if "make_world(" in text)
     exec(snippet, {})
     assert "(64, 4)" in capsys.readouterr().out
+
+
+def test_the_page_on_your_own_robot_runs(tmp_path, monkeypatch, capsys):
+    page = (REPOSITORY / "docs" / "own_robot.md").read_text(encoding="utf-8")
+    (model,) = re.findall(r"```xml\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    Path("wheel.xml").write_text(model)
+    names: dict = {"__name__": "own_robot"}
+    monkeypatch.setitem(sys.modules, "own_robot", types.ModuleType("own_robot"))  # for dataclasses
+    for snippet in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(snippet, names)
+    assert names["config"].pair.task.mjcf.is_file()
+    assert names["obs"].shape == (8, 4)
+    assert np.isfinite(names["metrics"]["value_loss"])
+    assert "(8, 4)" in capsys.readouterr().out
