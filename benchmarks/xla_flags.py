@@ -21,6 +21,7 @@ from garat_jax import dynamics
 from garat_jax.dynamics import Dynamics
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.errors import UserError
+from garat_jax.overrides import load_spec
 from garat_jax.train import FUSION_EMITTERS, chain_depth
 
 ARM = """
@@ -129,7 +130,7 @@ def main() -> None:
     arguments = tyro.cli(Arguments)
     if FUSION_EMITTERS in os.environ.get("XLA_FLAGS", "") or jax.default_backend() != "cpu":
         raise UserError(f"needs a CPU backend, and an XLA_FLAGS without {FUSION_EMITTERS}")
-    pendulum = dynamics.load_spec(InvertedPendulum.mjcf)
+    pendulum = load_spec(InvertedPendulum.mjcf)
     programs = [
         *programs_of("arm", mujoco.MjSpec.from_string(ARM), arguments.batch, slow=5),
         *programs_of("inverted_pendulum", pendulum, arguments.batch, slow=500),

@@ -7,8 +7,6 @@ forces.
 """
 
 import copy
-import dataclasses
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -18,9 +16,10 @@ import numpy as np
 from flax import struct
 
 from garat_jax._mjx import mjx
-from garat_jax.effects.base import OBJECT_TYPES, Effect, ModelView
+from garat_jax.effects.base import Effect, ModelView
 from garat_jax.engine import HostModel
 from garat_jax.errors import UserError, unknown_name
+from garat_jax.overrides import Override
 from garat_jax.setconst import CONSTANT_INPUTS, set_const
 
 ENGINES = ("auto", "mjx", "mujoco")
@@ -68,93 +67,6 @@ class Dynamics:
     def timestep(self) -> float:
         """Seconds of one physics substep."""
         return self.host.model.opt.timestep
-
-
-@dataclasses.dataclass(frozen=True)
-class Override:
-    """One change of a model before it is compiled.
-
-    Attributes:
-        element: `body`, `joint`, `geom`, `actuator` or `option`.
-        name: The element's name; empty for `option`.
-        field: The field of MuJoCo's spec. A body's `mass` scales its inertia with it, whether it
-            is given explicitly or comes from the body's geoms.
-        value: The new value.
-    """
-
-    element: str
-    name: str
-    field: str
-    value: Any
-
-    def apply(self, spec: mujoco.MjSpec) -> None:
-        """Write the change into a spec.
-
-        Raises:
-            UserError: There is no such element or field.
-        """
-        target = self._find(spec)
-        if self.element == "body" and self.field == "mass":
-            _scale_mass(spec, target, float(self.value))
-            return
-        known = [name for name in dir(target) if not name.startswith("_")]
-        if self.field not in known:
-            raise unknown_name(f"{self.element} field", self.field, known)
-        try:
-            current = getattr(target, self.field)
-            if jnp.ndim(current) == 1 and jnp.ndim(self.value) == 0:
-                current[0] = self.value
-            else:
-                setattr(target, self.field, self.value)
-        except (TypeError, ValueError) as error:
-            raise UserError(f"{self.element}/{self.name} {self.field}: {error}") from error
-
-    def _find(self, spec: mujoco.MjSpec):
-        if self.element == "option":
-            return spec.option
-        if self.element not in OBJECT_TYPES:
-            raise unknown_name("element", self.element, [*OBJECT_TYPES, "option"])
-        target = getattr(spec, self.element)(self.name)
-        if target is None:
-            listing = {"body": "bodies"}.get(self.element, f"{self.element}s")
-            raise unknown_name(self.element, self.name, [e.name for e in getattr(spec, listing)])
-        return target
-
-
-def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:
-    """Scale a body's inertial and its geoms: the compiler decides which of them counts."""
-    if mass <= 0:
-        raise UserError(f"body/{body.name} mass must be positive, not {mass:g} kg")
-    ratio = mass / float(spec.copy().compile().body(body.name).mass[0])
-    body.mass = body.mass * ratio
-    body.inertia = body.inertia * ratio
-    body.fullinertia = body.fullinertia * ratio
-    for geom in body.geoms:
-        if geom.mass > 0:
-            geom.mass = geom.mass * ratio
-        else:
-            geom.density = geom.density * ratio
-    compiled = float(spec.copy().compile().body(body.name).mass[0])
-    if abs(compiled - mass) > 1e-6 * mass:
-        raise UserError(
-            f"body/{body.name} mass is {compiled:g} kg whatever is asked for: "
-            "settotalmass or boundmass of the model's compiler overrules it"
-        )
-
-
-def load_spec(mjcf: str | Path) -> mujoco.MjSpec:
-    """Read an MJCF file.
-
-    Raises:
-        UserError: The file is missing or MuJoCo cannot read it.
-    """
-    path = Path(mjcf)
-    if not path.is_file():
-        raise UserError(f"{path}: no such model file")
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise UserError(f"{path}: {' '.join(str(error).split())}") from error
 
 
 def compile(
@@ -279,7 +191,8 @@ def move(
     model = view(dynamics)
     constants = _constants(dynamics, model)
     if not any(effect.reads_state for effect in dynamics.effects):
-        commands, forces, memory = _commands(dynamics, model, state, ctrl, num_substeps)
+        inputs = _commands(dynamics, model, None, state.memory, ctrl, num_substeps)
+        commands, forces, memory = inputs
         state = _advance(dynamics, constants, state, commands, forces, num_substeps)
         return state._replace(memory=memory)
 
@@ -292,41 +205,50 @@ def move(
 
 
 def steps_at_once(dynamics: Dynamics) -> bool:
-    """Say whether `trajectory` can step these dynamics: nothing looks at the state on the way."""
+    """Say whether one call can take many steps: nothing looks at the state on the way."""
     if dynamics.engine != "mujoco" or dynamics.host.model.na:
         return False
     return not any(effect.reads_state or effect.notes for effect in dynamics.effects)
 
 
 def trajectory(
-    dynamics: Dynamics, state: PhysicsState, ctrl: jax.Array, num_substeps: int, warm_up: int = 0
+    dynamics: Dynamics,
+    state: PhysicsState,
+    ctrl: jax.Array,
+    num_substeps: int,
+    warm_up: int = 0,
+    along: jax.Array | None = None,
 ) -> PhysicsState:
-    """Take many control steps in one call of C MuJoCo; see `steps_at_once`.
+    """Take many control steps in one call of C MuJoCo.
 
     Args:
-        dynamics: The physics.
+        dynamics: The physics; see `steps_at_once`.
         state: Where the first step after the warm-up begins.
         ctrl: Commands, [warm_up + T, nu].
         num_substeps: Physics substeps of a control step.
         warm_up: Commands that fill the effects' memories before the motion begins.
+        along: qpos and qvel that the effects see in each control step, [warm_up + T, nq + nv],
+            instead of those that they lead to: then effects may look at the state.
 
     Returns:
         The states after each of the T control steps; of them only qpos and qvel are new.
     """
     model = view(dynamics)
     constants = _constants(dynamics, model)
-    num_steps, host = ctrl.shape[0] - warm_up, dynamics.host
+    num_steps, host, nq = ctrl.shape[0] - warm_up, dynamics.host, dynamics.host.model.nq
 
-    def control_step(memory, command):
-        state_then = state._replace(memory=memory)
-        *inputs, memory = _commands(dynamics, model, state_then, command, num_substeps)
-        return memory, tuple(inputs)
+    def control_step(memory, inputs):
+        command, seen = inputs
+        if seen is not None:
+            seen = state._replace(qpos=seen[:nq], qvel=seen[nq:])
+        *results, memory = _commands(dynamics, model, seen, memory, command, num_substeps)
+        return memory, tuple(results)
 
-    _, (commands, forces) = jax.lax.scan(control_step, state.memory, ctrl)
+    _, (commands, forces) = jax.lax.scan(control_step, state.memory, (ctrl, along))
     commands, forces = (x[warm_up:].reshape(-1, x.shape[-1]) for x in (commands, forces))
     path = host.trace(constants, state, commands, forces, num_steps, num_substeps)
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_steps, *x.shape)), state)
-    return states._replace(qpos=path[:, : host.model.nq], qvel=path[:, host.model.nq :])
+    return states._replace(qpos=path[:, :nq], qvel=path[:, nq:])
 
 
 def note(dynamics: Dynamics, state: PhysicsState, seconds: float) -> PhysicsState:
@@ -352,16 +274,19 @@ def _act(dynamics: Dynamics, model: ModelView, state, ctrl, memories):
     return ctrl, force, tuple(updated)
 
 
-def _commands(dynamics: Dynamics, model: ModelView, state, ctrl, num_substeps: int):
-    """Return commands [substeps or 1, nu], forces alike [.., nv], and the memory after them."""
+def _commands(dynamics: Dynamics, model: ModelView, seen, memory, ctrl, num_substeps: int):
+    """Return commands [substeps or 1, nu], forces alike [.., nv], and the memory after them.
+
+    `seen` is the state that effects see in all of the substeps, None if none looks at it.
+    """
     if not any(effect.acts for effect in dynamics.effects):
-        return ctrl[None], jnp.zeros((1, dynamics.host.model.nv), ctrl.dtype), state.memory
+        return ctrl[None], jnp.zeros((1, dynamics.host.model.nv), ctrl.dtype), memory
 
     def substep(memory, _):
-        command, force, memory = _act(dynamics, model, None, ctrl, memory)
+        command, force, memory = _act(dynamics, model, seen, ctrl, memory)
         return memory, (command, force)
 
-    memory, (commands, forces) = jax.lax.scan(substep, state.memory, length=num_substeps)
+    memory, (commands, forces) = jax.lax.scan(substep, memory, length=num_substeps)
     return commands, forces, memory
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from garat_jax import dynamics
 from garat_jax.dynamics import Dynamics, PhysicsState
+from garat_jax.overrides import load_spec
 from garat_jax.types import Params
 
 
@@ -165,5 +166,5 @@ def make_world(
     Raises:
         UserError: As `dynamics.compile`.
     """
-    params = dynamics.compile(dynamics.load_spec(task.mjcf), overrides, effects, engine)
+    params = dynamics.compile(load_spec(task.mjcf), overrides, effects, engine)
     return World(TaskEnv(task, params), params)

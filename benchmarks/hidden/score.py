@@ -13,7 +13,8 @@ from garat_jax.diagnosis.diagnose import split, thin
 from garat_jax.diagnosis.fit import Problem, settle
 from garat_jax.diagnosis.rank import make_metric
 from garat_jax.diagnosis.results import Candidate, Named
-from garat_jax.diagnosis.simulate import Simulator, choose_grid, cut
+from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE
 

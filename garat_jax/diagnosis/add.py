@@ -12,7 +12,8 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, make_effect
 from garat_jax.diagnosis.rank import make_metric
 from garat_jax.diagnosis.results import Estimate
-from garat_jax.diagnosis.simulate import Simulator, choose_grid
+from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.effects import Effect, unit_at
 from garat_jax.errors import UserError, choose
 

@@ -18,7 +18,8 @@ from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.diagnosis.rank import ABOVE_FLOOR, Floor, make_metric, noise_floor
 from garat_jax.diagnosis.replay import Replay, Size, replay_with
 from garat_jax.diagnosis.results import Errors
-from garat_jax.diagnosis.simulate import Simulator, choose_grid
+from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue

@@ -14,14 +14,9 @@ from garat_jax.diagnosis.measurements import Recording, signals
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.rank import Outcome, explain, make_metric
 from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
+from garat_jax.diagnosis.segments import Segments, choose_grid, cut, nearby_starts
 from garat_jax.diagnosis.separate import next_experiment
-from garat_jax.diagnosis.simulate import (
-    Segments,
-    Simulator,
-    choose_grid,
-    cut,
-    nearby_starts,
-)
+from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
 from garat_jax.provenance import versions

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize, stats
 
-from garat_jax.diagnosis.simulate import Segments, Simulator, nearby_starts
+from garat_jax.diagnosis.segments import Segments, nearby_starts
+from garat_jax.diagnosis.simulate import Simulator
 
 BLOCK = 0.25
 """Seconds of the shortest block within which errors may be correlated, in robust variances."""
@@ -53,6 +54,13 @@ class Problem:
         residual = (predicted - s.measured) * (s.weight[..., None] / s.noise)
         residual = np.where(np.isfinite(residual), residual, LARGE)
         return np.clip(residual, -LARGE, LARGE).reshape(*residual.shape[:-2], -1)
+
+    def whiten_change(self, change: np.ndarray) -> np.ndarray:
+        """Return changes of predictions [..., S, L, num_signals], whitened, [..., S, N]."""
+        s = self.segments
+        change = change * (s.weight[..., None] / s.noise)
+        change = np.where(np.isfinite(change), change, 0.0)
+        return np.clip(change, -LARGE, LARGE).reshape(*change.shape[:-2], -1)
 
     def integrator_error(
         self, theta: np.ndarray, start: np.ndarray, residual: np.ndarray

@@ -14,10 +14,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from garat_jax.dynamics import Dynamics, Override, compile, load_spec
+from garat_jax.dynamics import Dynamics, Override, compile
 from garat_jax.effects import CATALOGUE, Effect
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.errors import UserError, choose, unknown_name
+from garat_jax.overrides import load_spec
 
 FORMAT = "garat-model/1"
 CARD_KEYS = ("format", "mjcf", "override", "effect")

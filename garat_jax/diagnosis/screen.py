@@ -174,10 +174,10 @@ def _plan(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], li
             for j in columns[1:]:
                 base = start[j] if j in start else float(theta[j])
                 step = _step_within(simulator, j, base)
-                if len(start) == 1:
-                    rows.append(_Row(j, {j: base + step}, step, -1))
+                alone = effect.independent and len(start) == 1
                 chosen.append(len(rows))
-                rows.append(_Row(j, {**start, j: base + step}, step, first))
+                values = {j: base + step} if alone else {**start, j: base + step}
+                rows.append(_Row(j, values, step, -1 if alone else first))
             trials.append(_Trial(index, start, tuple(chosen), len(starts) == 1))
     return rows, trials
 
@@ -194,12 +194,9 @@ def _measure(problem: Problem, fit: Fit, rows: list[_Row], trials: list[_Trial])
     thetas = np.tile(fit.theta, (len(rows), 1))
     for theta, row in zip(thetas, rows, strict=True):
         theta[list(row.values)] = list(row.values.values())
-    starts = np.broadcast_to(fit.start, (len(rows), *fit.start.shape))
-    moved = problem.whiten(simulator.predict(thetas, starts, segments))
-    changes = moved - lin.residual
-    for change, row in zip(changes, rows, strict=True):
-        if row.below >= 0:
-            change -= moved[row.below] - lin.residual
+    moved = problem.whiten_change(simulator.linear_change(thetas, fit.theta, fit.start, segments))
+    below = [moved[row.below] if row.below >= 0 else 0.0 for row in rows]
+    changes = np.stack([change - other for change, other in zip(moved, below, strict=True)])
     integrator = problem.integrator_error(fit.theta, fit.start, lin.residual)
     nuisances = np.stack([integrator, *_offsets(problem)])
     remove = _Remover(lin, fitted)
@@ -260,7 +257,7 @@ def _without(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 def _score(problem: Problem, s: _Sensitivities, rows: list[_Row], trial: _Trial) -> Score:
     """Judge one candidate at one size."""
-    chosen = _choose_rows(s, rows, trial)
+    chosen = list(trial.rows)
     slots = [problem.simulator.slots[rows[i].column].parameter for i in chosen]
     matrix = s.changes[:, chosen]
     norm = np.linalg.norm(matrix, axis=0)
@@ -287,16 +284,6 @@ def _score(problem: Problem, s: _Sensitivities, rows: list[_Row], trial: _Trial)
     p_value = _wald(matrix, s.residual, _orthonormal(np.concatenate(nuisances, 1)), s.labels)
     columns = tuple(rows[i].column for i in chosen)
     return Score(trial.effect, columns, size, start, share, p_value, possible, contribution)
-
-
-def _choose_rows(s: _Sensitivities, rows: list[_Row], trial: _Trial) -> list[int]:
-    """Choose for each parameter its change alone, or switched on where alone it does nothing."""
-    chosen = []
-    for i in trial.rows:
-        alone = i - 1
-        is_free = rows[i].below >= 0 and rows[alone].values.keys() == {rows[i].column}
-        chosen.append(alone if is_free and np.any(s.changes[:, alone]) else i)
-    return chosen
 
 
 def _size(simulator: Simulator, rows: list[_Row], trial: _Trial, chosen: list[int], factor):

@@ -11,7 +11,7 @@ from garat_jax.diagnosis import compare, load_model
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
-from garat_jax.diagnosis.simulate import Segments
+from garat_jax.diagnosis.segments import Segments
 from tests import models
 
 

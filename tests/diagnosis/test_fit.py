@@ -12,7 +12,8 @@ from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.screen import cosine, screen
-from garat_jax.diagnosis.simulate import Simulator, choose_grid, cut, signal_noise
+from garat_jax.diagnosis.segments import choose_grid, cut, signal_noise
+from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.effects import ActuatorDelay
 from tests import models
 

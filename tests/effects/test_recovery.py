@@ -15,7 +15,8 @@ from garat_jax.diagnosis.diagnose import make_candidates
 from garat_jax.diagnosis.fit import Problem, fit
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.simulate import Simulator, choose_grid, cut
+from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.diagnosis.simulate import Simulator
 from tests.models import PENDULUM, SLIDER, spec
 
 REFINEMENT = 32

@@ -12,6 +12,7 @@ from garat_jax.envs import ant
 from garat_jax.envs.ant import Ant
 from garat_jax.envs.pairs import PAIRS
 from garat_jax.envs.rotation import roll_pitch_yaw, uprightness
+from garat_jax.overrides import load_spec
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +95,7 @@ def test_it_stands_on_four_feet_when_it_does_nothing(world):
 
 
 def test_gravity_is_the_papers():
-    spec = dynamics.load_spec(Ant().mjcf)
+    spec = load_spec(Ant().mjcf)
     for overrides, gravity in ((PAIRS["ant"].source, -4.91), (PAIRS["ant"].target, -9.81)):
         model = dynamics.compile(spec, overrides, engine="mujoco").host.model
         np.testing.assert_array_equal(model.opt.gravity, [0, 0, gravity])

@@ -1,0 +1,199 @@
+"""Recordings cut into segments with free initial states (multiple shooting).
+
+Signals are `qpos`, then `qvel` where every recording measured it.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import integrate
+
+from garat_jax.diagnosis.measurements import Recording, noise
+from garat_jax.errors import UserError
+
+WARM_UP = 0.1
+"""Seconds of commands before each segment: they fill delays and activations (at most 0.1 s)."""
+UNIFORM = 0.01
+"""Largest deviation of a sampling interval, relative to their median, that counts as uniform."""
+SHORTEST = 10
+"""Samples that a segment must have."""
+SMALLEST_NOISE = 1e-4
+"""Noise assumed at least, relative to the signal's standard deviation."""
+KINEMATIC_WINDOW = 0.05
+"""Seconds over which position and velocity sensors are held against each other."""
+CONTRADICTION = 1.5
+"""How much more than their white noise the two sensors must differ before it counts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Segments:
+    """Measurements cut for multiple shooting; sample k of a segment is at `times[k]`.
+
+    Attributes:
+        measured: Measured signals, [S, L, num_signals].
+        weight: 1 for a sample, 0 for padding, [S, L].
+        start: Measured initial state (qpos, qvel), [S, nq + nv].
+        ctrl: Command of every simulated step, the warm-up's first, [S, warm_up + steps, nu].
+        place: Where a sample lies between simulated steps, [S, L].
+        recording: Index of the recording, [S].
+        first: Index of the first sample within its recording, [S].
+        noise: Standard deviation of each signal's noise, [num_signals].
+        spread: Standard deviation of each signal, [num_signals].
+    """
+
+    measured: np.ndarray
+    weight: np.ndarray
+    start: np.ndarray
+    ctrl: np.ndarray
+    place: np.ndarray
+    recording: np.ndarray
+    first: np.ndarray
+    noise: np.ndarray
+    spread: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """The steps at which commands change and states are recorded.
+
+    Attributes:
+        interval: Seconds of one simulated step.
+        substeps: Physics substeps in it.
+        per_sample: Simulated steps a sample; samples lie on steps where sampling is uniform.
+        uniform: Whether every recording is sampled uniformly at the same rate.
+    """
+
+    interval: float
+    substeps: int
+    per_sample: int
+    uniform: bool
+
+    @property
+    def timestep(self) -> float:
+        """Seconds of one physics substep."""
+        return self.interval / self.substeps
+
+
+def choose_grid(recordings: Sequence[Recording], timestep: float) -> Grid:
+    """Match the physics to the sampling.
+
+    Uniform sampling: a step is a sample, in substeps no longer than the model's timestep. Otherwise
+    a step is no longer than the model's timestep, commands are held on these steps, and
+    predictions are interpolated linearly between them.
+    """
+    intervals = np.concatenate([np.diff(r.time[a:b]) for r in recordings for a, b in r.spans])
+    sample = float(np.median(intervals))
+    substeps = max(1, int(np.ceil(sample / timestep - 1e-6)))
+    if np.abs(intervals - sample).max() <= UNIFORM * sample:
+        return Grid(sample, substeps, 1, True)
+    return Grid(sample / substeps, 1, substeps, False)
+
+
+def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments:
+    """Cut recordings into segments of a horizon, each with the commands that led to it.
+
+    Args:
+        recordings: What was measured.
+        grid: The simulated steps.
+        horizon: Seconds of a segment.
+
+    Raises:
+        UserError: No span is long enough for one segment.
+    """
+    sample = grid.interval * grid.per_sample
+    length = max(SHORTEST, round(horizon / sample))
+    measured_velocity = all(r.velocity_measured for r in recordings)
+    pieces = [
+        (index, start, min(start + length, stop))
+        for index, r in enumerate(recordings)
+        for a, stop in r.spans
+        for start in range(a, stop, length)
+        if min(start + length, stop) - start >= min(SHORTEST, length)
+    ]
+    if not pieces:
+        raise UserError(f"the recordings have no {SHORTEST} samples in a row; record for longer")
+    steps = max(_steps(recordings[i].time[a:b], grid) for i, a, b in pieces)
+    warm_up = warm_up_steps(grid, recordings[0].ctrl.shape[1])
+    rows = [_piece(recordings[i], a, b, length, steps, warm_up, grid) for i, a, b in pieces]
+    measured, weight, start, ctrl, place = (np.stack(parts) for parts in zip(*rows, strict=True))
+    num_position = recordings[0].qpos.shape[1]
+    num_signals = measured.shape[2] if measured_velocity else num_position
+    deviations = np.sqrt(np.mean([signal_noise(r) ** 2 for r in recordings], axis=0))
+    measured = measured[..., :num_signals]
+    spread = measured[weight > 0].std(axis=0) + 1e-12
+    return Segments(
+        measured=measured,
+        weight=weight,
+        start=start,
+        ctrl=ctrl,
+        place=place,
+        recording=np.asarray([i for i, _, _ in pieces]),
+        first=np.asarray([a for _, a, _ in pieces]),
+        noise=np.maximum(deviations[:num_signals], SMALLEST_NOISE * spread),
+        spread=spread,
+    )
+
+
+def warm_up_steps(grid: Grid, num_actuators: int) -> int:
+    """Return the steps before each segment; without actuators nothing has to fill."""
+    return int(np.ceil(WARM_UP / grid.interval)) if num_actuators else 0
+
+
+def signal_noise(recording: Recording) -> np.ndarray:
+    """Estimate each signal's error, [nq + nv]: white noise, or sensors that contradict each other.
+
+    Filtered velocities have little white noise and are still wrong. What the change of position
+    over a short window differs from the integral of velocity, beyond white noise, is the
+    velocity's error. (Joints of one dof alone; a quaternion is no integral.)
+    """
+    white = np.asarray(noise(recording))
+    num = recording.qpos.shape[1]
+    if not recording.velocity_measured or num != recording.qvel.shape[1]:
+        return white
+    changes = []
+    interval = float(np.median(np.diff(recording.time)))
+    window = max(2, round(KINEMATIC_WINDOW / interval))
+    for a, b in recording.spans:
+        time, speed = recording.time[a:b], recording.qvel[a:b]
+        travelled = integrate.cumulative_trapezoid(speed, time, axis=0, initial=0.0)
+        difference = recording.qpos[a:b] - travelled
+        changes.append(difference[window:] - difference[:-window])
+    duration = window * interval
+    apart = np.sqrt(np.mean(np.concatenate(changes) ** 2, axis=0)) / duration
+    expected = np.hypot(np.sqrt(2) * white[:num] / duration, white[num:] / np.sqrt(window))
+    systematic = np.sqrt(np.maximum(apart**2 - expected**2, 0.0))
+    contradicts = apart > CONTRADICTION * expected
+    return np.concatenate(
+        [white[:num], np.where(contradicts, np.hypot(white[num:], systematic), white[num:])]
+    )
+
+
+def _steps(time: np.ndarray, grid: Grid) -> int:
+    if grid.uniform:
+        return len(time) - 1
+    return int(np.ceil((time[-1] - time[0]) / grid.interval)) + 1
+
+
+def _piece(recording: Recording, a: int, b: int, length: int, steps: int, warm_up: int, grid: Grid):
+    """Return one segment's measured [L, nq + nv], weight, start, ctrl and place, padded."""
+    padding = (0, length - (b - a))
+    state = np.concatenate([recording.qpos, recording.qvel], axis=1)
+    measured = np.pad(state[a:b], (padding, (0, 0)), mode="edge")
+    weight = np.pad(np.ones(b - a), padding)
+    offsets = np.arange(-warm_up, steps)
+    if grid.uniform:
+        held = a + offsets
+        place = np.arange(length, dtype=float)
+    else:
+        times = recording.time[a] + offsets * grid.interval
+        held = np.searchsorted(recording.time, times + 0.5 * grid.interval, side="right") - 1
+        place = np.pad((recording.time[a:b] - recording.time[a]) / grid.interval, padding)
+    ctrl = recording.ctrl[np.clip(held, 0, len(recording.time) - 1)]
+    return measured, weight, state[a], ctrl, np.minimum(place, steps)
+
+
+def nearby_starts(segments: Segments, size: float) -> np.ndarray:
+    """Return each initial-state component's perturbation, relative to its spread, [nq + nv]."""
+    spread = segments.start.std(axis=0)
+    return size * np.maximum(spread, 1e-3 * max(float(spread.max()), 1e-3))

@@ -1,0 +1,98 @@
+"""Changes of a model before it is compiled: what makes a source or a target of it."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from garat_jax.effects.base import OBJECT_TYPES
+from garat_jax.errors import UserError, unknown_name
+
+
+@dataclasses.dataclass(frozen=True)
+class Override:
+    """One change of a model before it is compiled.
+
+    Attributes:
+        element: `body`, `joint`, `geom`, `actuator` or `option`.
+        name: The element's name; empty for `option`.
+        field: The field of MuJoCo's spec. A body's `mass` scales its inertia with it, whether it
+            is given explicitly or comes from the body's geoms.
+        value: The new value.
+    """
+
+    element: str
+    name: str
+    field: str
+    value: Any
+
+    def apply(self, spec: mujoco.MjSpec) -> None:
+        """Write the change into a spec.
+
+        Raises:
+            UserError: There is no such element or field.
+        """
+        target = self._find(spec)
+        if self.element == "body" and self.field == "mass":
+            _scale_mass(spec, target, float(self.value))
+            return
+        known = [name for name in dir(target) if not name.startswith("_")]
+        if self.field not in known:
+            raise unknown_name(f"{self.element} field", self.field, known)
+        try:
+            current = getattr(target, self.field)
+            if np.ndim(current) == 1 and np.ndim(self.value) == 0:
+                current[0] = self.value
+            else:
+                setattr(target, self.field, self.value)
+        except (TypeError, ValueError) as error:
+            raise UserError(f"{self.element}/{self.name} {self.field}: {error}") from error
+
+    def _find(self, spec: mujoco.MjSpec):
+        if self.element == "option":
+            return spec.option
+        if self.element not in OBJECT_TYPES:
+            raise unknown_name("element", self.element, [*OBJECT_TYPES, "option"])
+        target = getattr(spec, self.element)(self.name)
+        if target is None:
+            listing = {"body": "bodies"}.get(self.element, f"{self.element}s")
+            raise unknown_name(self.element, self.name, [e.name for e in getattr(spec, listing)])
+        return target
+
+
+def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:
+    """Scale a body's inertial and its geoms: the compiler decides which of them counts."""
+    if mass <= 0:
+        raise UserError(f"body/{body.name} mass must be positive, not {mass:g} kg")
+    ratio = mass / float(spec.copy().compile().body(body.name).mass[0])
+    body.mass = body.mass * ratio
+    body.inertia = body.inertia * ratio
+    body.fullinertia = body.fullinertia * ratio
+    for geom in body.geoms:
+        if geom.mass > 0:
+            geom.mass = geom.mass * ratio
+        else:
+            geom.density = geom.density * ratio
+    compiled = float(spec.copy().compile().body(body.name).mass[0])
+    if abs(compiled - mass) > 1e-6 * mass:
+        raise UserError(
+            f"body/{body.name} mass is {compiled:g} kg whatever is asked for: "
+            "settotalmass or boundmass of the model's compiler overrules it"
+        )
+
+
+def load_spec(mjcf: str | Path) -> mujoco.MjSpec:
+    """Read an MJCF file.
+
+    Raises:
+        UserError: The file is missing or MuJoCo cannot read it.
+    """
+    path = Path(mjcf)
+    if not path.is_file():
+        raise UserError(f"{path}: no such model file")
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise UserError(f"{path}: {' '.join(str(error).split())}") from error
