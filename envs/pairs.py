@@ -7,6 +7,8 @@ from garat_jax.envs.ant import Ant
 from garat_jax.envs.half_cheetah import HalfCheetah
 from garat_jax.envs.hopper import Hopper
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
+from garat_jax.envs.minitaur import Minitaur
+from garat_jax.envs.minitaur_motors import SaturatedMotors
 from garat_jax.envs.walker2d import Walker2d
 from garat_jax.transfer import Pair
 
@@ -68,5 +70,13 @@ PAIRS: dict[str, Pair] = {
         task=Ant(),
         source=(Override("option", "", "gravity", np.asarray([0.0, 0.0, -4.91])),),
         target=(Override("option", "", "gravity", np.asarray([0.0, 0.0, -9.81])),),
+    ),
+    "minitaur": Pair(
+        name="minitaur",
+        summary="Minitaur whose motors' torque saturates with the current instead of following it",
+        task=Minitaur(),
+        source=(),
+        target=(),
+        target_effects=(SaturatedMotors("all"),),
     ),
 }

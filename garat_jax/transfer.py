@@ -18,6 +18,7 @@ from garat_jax.agents import trpo
 from garat_jax.agents.actor_critic import ActorCriticState, PolicyParams
 from garat_jax.agents.trpo import TRPOConfig
 from garat_jax.dynamics import Override
+from garat_jax.effects import Effect
 from garat_jax.env import Env, Task, World, make_world
 from garat_jax.methods.garat import GARAT, GARATConfig
 from garat_jax.methods.gat import GAT, GATConfig
@@ -39,6 +40,8 @@ class Pair:
         task: What both worlds ask of the agent.
         source: Overrides that make the source.
         target: Overrides that make the target.
+        source_effects: Physical effects that the source has.
+        target_effects: Physical effects that the target has.
     """
 
     name: str
@@ -46,6 +49,15 @@ class Pair:
     task: Task
     source: tuple[Override, ...]
     target: tuple[Override, ...]
+    source_effects: tuple[Effect, ...] = ()
+    target_effects: tuple[Effect, ...] = ()
+
+    def worlds(self, engine: str = "auto") -> tuple[World, World]:
+        """Compile the source and the target."""
+        return (
+            make_world(self.task, self.source, self.source_effects, engine),
+            make_world(self.task, self.target, self.target_effects, engine),
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,8 +234,7 @@ def make_method(env: Env, agent: Policy, config: GARATConfig | GATConfig) -> GAR
 def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
     """Run the experiment; write `summary.json` and return what is in it."""
     task = config.pair.task
-    source = make_world(task, config.pair.source, engine=config.engine)
-    target = make_world(task, config.pair.target, engine=config.engine)
+    source, target = config.pair.worlds(config.engine)
     run.record_settings(dataclasses.replace(config, engine=source.params.engine))
     agent = trpo.make(source.env, config.agent)
     trainer = Trainer(run, range(config.first_seed, config.first_seed + config.seeds))

@@ -74,10 +74,7 @@ def test_every_pair_has_two_worlds_that_differ(name):
     pair = PAIRS[name]
     assert pair.name == name
     assert pair.summary
-    source, target = (
-        make_world(pair.task, overrides, engine="mujoco")
-        for overrides in (pair.source, pair.target)
-    )
+    source, target = pair.worlds("mujoco")
     in_source, in_target = observations(source), observations(target)
     np.testing.assert_array_equal(in_source[0], in_target[0])
     assert np.abs(in_source - in_target).max() > 1e-4

@@ -54,18 +54,45 @@ def observations(world, physics, actions):
     return np.asarray(jax.jit(jax.vmap(run, in_axes=(0, 1), out_axes=1))(physics, actions))
 
 
+def errors_by_state(name):
+    """Return the largest difference of an observation between the engines, [steps, states]."""
+    worlds = [make_world(ENVS[name](), engine=engine) for engine in ("mujoco", "mjx")]
+    physics = states_on_the_way(worlds[0])
+    shape = (5, NUM_STATES, worlds[0].env.action_size)
+    actions = jax.random.uniform(jax.random.key(1), shape, minval=-1, maxval=1)
+    ours, mjx = (observations(world, physics, actions) for world in worlds)
+    assert np.abs(ours[4] - ours[0]).max() > 0.1
+    return np.abs(ours - mjx).max(axis=2)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("double", [True, False], ids=["float64", "float32"])
 @pytest.mark.parametrize("name", TOLERANCES)
 def test_both_engines_agree(name, double):
     with jax.enable_x64(double):
-        worlds = [make_world(ENVS[name](), engine=engine) for engine in ("mujoco", "mjx")]
-        physics = states_on_the_way(worlds[0])
-        shape = (5, NUM_STATES, worlds[0].env.action_size)
-        actions = jax.random.uniform(jax.random.key(1), shape, minval=-1, maxval=1)
-        ours, mjx = (observations(world, physics, actions) for world in worlds)
-    errors = np.abs(ours - mjx).max(axis=(1, 2))
+        errors = errors_by_state(name).max(axis=1)
     first, fifth = (DOUBLE, DOUBLE) if double else TOLERANCES[name]
     assert errors[0] < first, errors
     assert errors[4] < fifth, errors
-    assert np.abs(ours[4] - ours[0]).max() > 0.1
+
+
+# In some states of these two the engines differ by more than rounding. MuJoCo 4.0 gives the
+# reference acceleration of a loop closure a part that grows with the square of the rates, which MJX
+# 3.17 lacks; and in about a quarter of Ant's states the accelerations differ, why is open.
+MEDIANS = {
+    "ant": (1e-5, 2e-2),  # measured: below 1e-6, 4e-3
+    "minitaur": (0.2, 0.7),  # 0.05, 0.15; rates reach 30 rad/s
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MEDIANS)
+def test_both_engines_agree_in_most_states(name):
+    errors = np.median(errors_by_state(name), axis=1)
+    first, fifth = MEDIANS[name]
+    assert errors[0] < first, errors
+    assert errors[4] < fifth, errors
+
+
+def test_every_environment_is_compared():
+    assert set(TOLERANCES) | set(MEDIANS) == set(ENVS)

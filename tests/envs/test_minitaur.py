@@ -8,8 +8,9 @@ import pytest
 
 from garat_jax import dynamics
 from garat_jax.env import make_world
-from garat_jax.envs import minitaur
+from garat_jax.envs import minitaur, minitaur_motors
 from garat_jax.envs.minitaur import Minitaur
+from garat_jax.envs.pairs import PAIRS
 
 LEGS = ("front_left", "back_left", "front_right", "back_right")
 SUPPLY, RESISTANCE, TORQUE_CONSTANT, TORQUE_LIMIT, KD = 16.0, 0.186, 0.0954, 5.7, 0.02
@@ -137,3 +138,34 @@ def test_the_duty_cycle_saturates_beyond_the_torque_limit(world):
     assert stall > TORQUE_LIMIT
     slow = (stall - TORQUE_LIMIT) / (TORQUE_CONSTANT**2 / RESISTANCE)
     assert slow > 50  # rad/s, up to which both bounds give the same torque
+
+
+@pytest.mark.parametrize(("command", "rate"), [(0.1, 0.0), (-0.4, 3.0), (0.9, -8.0), (-1.0, 0.0)])
+def test_the_targets_motors_follow_the_measured_curve(command, rate):
+    """One substep from rest in the air: the target moves as the source does under that torque."""
+    angle = 5 / 8 * np.pi
+    duty = np.pi / 4 * command - KD * rate
+    linear = TORQUE_CONSTANT * (SUPPLY * duty - TORQUE_CONSTANT * rate) / RESISTANCE
+    linear = np.clip(linear, -TORQUE_LIMIT, TORQUE_LIMIT)
+    currents, torques = [0, 10, 20, 30, 40, 50, 60], [0, 1, 1.9, 2.45, 3.0, 3.25, 3.5]
+    torque = np.sign(linear) * np.interp(abs(linear) / TORQUE_CONSTANT, currents, torques)
+    _, target = PAIRS["minitaur"].worlds("mujoco")
+    model = target.params.host.model
+    data = mujoco.MjData(model)
+    data.qpos[2] = 2.0
+    data.qpos[7 + minitaur.MOTORS], data.qvel[6 + minitaur.MOTORS] = angle, rate
+    data.qpos[8 + minitaur.MOTORS] = minitaur.knee_angle(jnp.asarray(angle))
+    state = dynamics.initial_state(target.params, jnp.asarray(data.qpos), jnp.asarray(data.qvel))
+    after = dynamics.step(target.params, state, jnp.full(8, command))
+    data.ctrl[:] = command
+    data.qfrc_applied[6 + minitaur.MOTORS] = torque - linear
+    mujoco.mj_step(model, data)
+    np.testing.assert_allclose(after.qvel, data.qvel, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(after.sensordata, linear, rtol=1e-4)
+    assert abs(torque - linear) > 1e-3
+
+
+def test_the_measured_curve_is_below_the_line_beyond_its_first_point():
+    current = minitaur_motors.CURRENTS[2:]
+    line = minitaur_motors.TORQUE_CONSTANT * current
+    assert (np.asarray(minitaur_motors.torque_of(jnp.asarray(current))) < line).all()
