@@ -56,6 +56,16 @@ class ContactEffect(Effect):
         return dict(zip((p.name for p in cls.parameters()), map(float, most), strict=True))
 
     @classmethod
+    def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
+        """Start at half and at twice each number, because sticking and slipping differ."""
+        base = cls.at(host, target)
+        return tuple(
+            {p.name: float(np.clip(factor * base[p.name], p.low, p.high))}
+            for p in cls.parameters()
+            for factor in (0.5, 2.0)
+        )
+
+    @classmethod
     def _joined(cls, host: mujoco.MjModel, geom: int) -> np.ndarray:
         """Return the numbers of all possible contacts as MuJoCo joins them, [n, parameters]."""
         num, rows = len(cls.parameters()), []
