@@ -15,13 +15,17 @@ from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, load_model
+from garat_jax.diagnosis.quality import Quality, assess
 from garat_jax.diagnosis.rank import ABOVE_FLOOR, Floor, make_metric, noise_floor
 from garat_jax.diagnosis.replay import Replay, Size, replay_with
+from garat_jax.diagnosis.residuals import Residuals, examine
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.torque import TorqueError, compare_torques
 from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE
+from garat_jax.effects.base import element_names
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.provenance import versions
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
@@ -52,20 +56,39 @@ class Comparison:
     versions: Mapping[str, str | None]
     seconds: float
     error: Errors
+    horizon: float
     horizons: tuple[AtHorizon, ...]
     where: tuple[Place, ...]
+    residuals: Residuals
+    torques: tuple[TorqueError, ...]
+    recordings: tuple[Quality, ...]
+
+    @property
+    def near_noise(self) -> bool:
+        """Whether the error is what noise and the integrator's own error would make."""
+        return self.error.before <= ABOVE_FLOOR * self.error.noise_floor
 
     @property
     def sentence(self) -> str:
         """How large the error is, in one sentence."""
         error = self.error
-        ratio = error.before / error.noise_floor
         size = f"{100 * error.before:.2g} % of the signals' spread"
-        if ratio <= ABOVE_FLOOR:
+        if self.near_noise:
             return f"The model is near the sensors' noise: its error is {size}."
         worst = [f"Most goes wrong at {p.signal}, {p.regime}." for p in self.where[:1]]
+        ratio = error.before / error.noise_floor
         said = f"The model's error is {size}, {ratio:.2g} times what noise alone would make."
         return " ".join([said, *worst])
+
+    def __str__(self) -> str:
+        lines = [self.sentence, f"  residuals: {self.residuals.sentence(self.near_noise)}"]
+        for name, row in self.error.per_signal.items():
+            lines.append(
+                f"  {name}: {row['before']:.4g} {row['unit']} (fit {row['fit_percent']:.1f} %, "
+                f"noise {row['noise_floor']:.2g} {row['unit']})"
+            )
+        lines += [f"  torque at {torque.sentence}" for torque in self.torques]
+        return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of compare.json; what is not finite is null."""
@@ -85,8 +108,10 @@ def compare(
         say: Told what is being done.
     """
     started = time.monotonic()
-    recordings = thin(recordings)
     host = native_model(model.compile(engine="mujoco"))
+    qualities = tuple(assess(r, host) for r in recordings)
+    torques = compare_torques(host, recordings)
+    recordings = thin(recordings)
     grid = choose_grid(recordings, host.opt.timestep)
     simulator = Simulator(model, (), grid)
     say("choosing the horizon")
@@ -103,11 +128,15 @@ def compare(
         versions=versions(),
         seconds=time.monotonic() - started,
         error=_errors(played[stated], floor),
+        horizon=stated,
         horizons=tuple(
             AtHorizon(h, p.error(), {n: s._asdict() for n, s in p.sizes().items()})
             for h, p in played.items()
         ),
         where=tuple(localise(missing_torque(host, recordings))),
+        residuals=examine(played[stated], recordings, element_names(host, "actuator")),
+        torques=torques,
+        recordings=qualities,
     )
 
 

@@ -14,6 +14,11 @@ from garat_jax.diagnosis.figures import label, was_fitted, words
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.report_data import (
+    recordings_section,
+    residuals_section,
+    torque_section,
+)
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Estimate
 from garat_jax.diagnosis.view import View, look
 from garat_jax.report import Fact, Figure, Reproduce, Section, Table
@@ -134,7 +139,14 @@ def write_comparison(
         sections=[
             _errors(error, view, everything),
             _traces(view, everything),
+            residuals_section(
+                comparison.residuals,
+                comparison.residuals.sentence(comparison.near_noise),
+                comparison.horizon,
+            ),
+            *torque_section(comparison.torques),
             *_where(comparison.where, view),
+            recordings_section(comparison.recordings),
         ],
         reproduce=Reproduce.from_config(run.read_json("config.json")),
     )
@@ -157,11 +169,11 @@ def _errors(error: Errors, view: View, chosen: Sequence[int]) -> Section:
         for name, row in error.per_signal.items()
     ]
     columns = ["signal", "unit", "model as it is", *(["repaired"] if view.after else []), "noise"]
+    sizes = [p.sizes() for p in after or before]
     by_horizon = [
-        (name, size.unit, *(p.sizes()[name].rmse for p in played))
-        for name, size in before[0].sizes().items()
-        for played in [after or before]
+        (name, size.unit, *(s[name].rmse for s in sizes)) for name, size in sizes[0].items()
     ]
+    fits = [(name, *(round(s[name].fit_percent, 1) for s in sizes)) for name in sizes[0]]
     over = f"over {', '.join(view.recordings[i].name for i in chosen)}"
     which = "repaired model" if view.after else "model as it is"
     return Section(
@@ -184,6 +196,12 @@ def _errors(error: Errors, view: View, chosen: Sequence[int]) -> Section:
                 ["signal", "unit", *(f"{p.horizon:g} s" for p in view.before)],
                 by_horizon,
                 f"Root mean square error of the {which} by horizon, {over}.",
+            ),
+            Table(
+                ["signal", *(f"{p.horizon:g} s" for p in view.before)],
+                fits,
+                f"Fit of the {which} in per cent, 100 (1 - |y - ŷ| / |y - mean y|): 100 is "
+                "perfect, 0 no better than the mean.",
             ),
         ],
     )

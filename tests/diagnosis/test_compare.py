@@ -65,10 +65,34 @@ def test_command_writes_what_scripts_read(recorded, tmp_path, capsys):
     assert content["error"]["after"] == content["error"]["before"]
     assert content["error"]["per_signal"]["qvel.hinge"]["unit"] == "rad/s"
     assert {"signal", "share", "regime", "evidence"} == set(content["where"][0])
+    whiteness = content["residuals"]["whiteness"]
+    assert [w["signal"] for w in whiteness] == ["qpos.hinge", "qvel.hinge"]
+    assert not any(w["white"] for w in whiteness)
+    assert content["residuals"]["independence"][0]["input"] == "motor"
+    assert content["torques"] == []
+    quality = content["recordings"][0]
+    assert quality["rate"] == pytest.approx(250.0)
+    assert (quality["gaps"], quality["velocity"]) == (0, "measured")
+    assert abs(quality["command_lag"]["motor"]) < 0.003
+    horizons = content["horizons"]
+    assert all(h["per_signal"]["qpos.hinge"]["fit_percent"] > 50 for h in horizons)
     page = (tmp_path / "run" / "report.html").read_text()
     assert "Comparison of pendulum" in page
-    assert "Measured against simulated" in page
+    for heading in ("Measured against simulated", "What the recordings are worth"):
+        assert heading in page
+    assert "not white: qpos.hinge, qvel.hinge" in page
     assert "report:" in capsys.readouterr().out
+
+
+def test_measured_torques_are_compared_where_there_are_any(recorded, tmp_path):
+    model, recordings = read(recorded, "coulomb_friction")
+    torque = {"hinge": recordings[0].ctrl[:, 0]}
+    found = compare(model, [dataclasses.replace(recordings[0], torque=torque)])
+    (error,) = found.torques
+    assert error.actuator_fit_percent > 95
+    assert error.motion_rmse > 3 * error.actuator_rmse
+    assert "torque at hinge: measured" in str(found)
+    assert found.to_json()["torques"][0]["unit"] == "N m"
 
 
 def test_command_refuses_a_recording_of_another_model(recorded, tmp_path, capsys):
@@ -77,7 +101,8 @@ def test_command_refuses_a_recording_of_another_model(recorded, tmp_path, capsys
     arm.write_text(models.ARM)
     status = cli.main(["compare", str(arm), str(files["none"][0]), "--out", str(tmp_path / "run")])
     assert status == 2
-    assert "unknown column 'qpos.hinge'" in capsys.readouterr().err
+    line = capsys.readouterr().err
+    assert "its commands are ctrl.motor, and the model's actuators want ctrl.shoulder" in line
 
 
 def handmade(predicted, measured, weight) -> Replay:

@@ -1,0 +1,174 @@
+"""Sections about the recordings themselves, about what is left, and about measured torques."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import plotly.graph_objects as go
+
+from garat_jax.diagnosis.quality import Quality
+from garat_jax.diagnosis.residuals import Residuals
+from garat_jax.diagnosis.torque import TorqueError
+from garat_jax.report import COLOURS, SOFT, Figure, Section, Table, styled
+
+MOST_DRAWN = 4
+"""Signals whose correlations are drawn, the least random first."""
+
+
+def recordings_section(recordings: Sequence[Quality]) -> Section:
+    """Return what the recordings are worth: rates, gaps, noise, steps and command lags."""
+    rows = [
+        (
+            q.name,
+            round(q.seconds, 2),
+            round(q.rate, 1),
+            "even" if q.irregularity < 0.01 else f"varies by {100 * q.irregularity:.0f} %",
+            q.gaps,
+            q.velocity,
+            "; ".join(_lag(name, lag) for name, lag in q.command_lag.items()) or "no commands",
+        )
+        for q in recordings
+    ]
+    channels = [
+        (q.name, name, c.unit, c.noise, c.step if c.step > 0 else "none seen")
+        for q in recordings
+        for name, c in q.channels.items()
+    ]
+    warnings = [warning for q in recordings for warning in q.warnings]
+    odd = "\n\n" + "\n".join(f"- {warning}" for warning in warnings) if warnings else ""
+    return Section(
+        "What the recordings are worth",
+        "Noise and steps of the sensors limit what any model can predict. A command lag means that "
+        "the torque, as the motion shows it, follows the recorded command that much later." + odd,
+        tables=[
+            Table(
+                [
+                    "recording",
+                    "seconds",
+                    "rate [Hz]",
+                    "sampling",
+                    "gaps",
+                    "velocity",
+                    "command lag",
+                ],
+                rows,
+                "Velocities that were not measured are estimated from positions and are not held "
+                "against the model.",
+            ),
+            Table(
+                ["recording", "signal", "unit", "noise", "step"],
+                channels,
+                "Noise: standard deviation of what changes from sample to sample at random. Step: "
+                "the smallest difference between two values, of an encoder for example.",
+            ),
+        ],
+    )
+
+
+def residuals_section(residuals: Residuals, sentence: str, horizon: float) -> Section:
+    """Return whether what the model leaves is random."""
+    rows = [
+        (
+            w.signal,
+            "its own past",
+            max(w.correlation, key=abs, default=0.0),
+            w.bound,
+            f"{w.outside} of {len(w.correlation)}",
+            "random" if w.white else "not random",
+        )
+        for w in residuals.whiteness
+    ]
+    rows += [
+        (
+            i.signal,
+            i.input,
+            max(i.correlation, key=abs, default=0.0),
+            i.bound,
+            f"{i.outside} of {len(i.correlation)}",
+            "random" if i.independent else "not random",
+        )
+        for i in residuals.independence
+    ]
+    columns = ["signal", "against", "largest", "bound", "beyond", "verdict"]
+    return Section(
+        "Is what the model leaves random?",
+        f"{sentence}\n\nThe deviations of predictions over {horizon:g} s are correlated with "
+        "themselves and with the commands of some samples before. Noise stays within the bounds; "
+        "what goes beyond them is something that a better model could explain.",
+        figures=[
+            Figure(
+                _correlations(residuals),
+                "Correlation of each deviation with itself some time before. Dotted: 99 % of pure "
+                "noise stays within.",
+                "Autocorrelation of the deviations",
+            )
+        ],
+        tables=[
+            Table(
+                columns,
+                rows,
+                "Largest: the largest correlation at any lag, -1 to 1. Beyond: at how many lags it "
+                "exceeds the bound; noise does so at two at most.",
+            )
+        ],
+    )
+
+
+def torque_section(torques: Sequence[TorqueError]) -> list[Section]:
+    """Return how measured torques and the model's differ; nothing without measurements."""
+    if not torques:
+        return []
+    rows = [
+        (
+            t.joint,
+            t.unit,
+            t.measured_rms,
+            t.motion_rmse,
+            round(t.motion_fit_percent, 1),
+            t.actuator_rmse,
+            round(t.actuator_fit_percent, 1),
+        )
+        for t in torques
+    ]
+    columns = ["joint", "unit", "measured", "motion", "fit [%]", "actuators", "fit [%]"]
+    return [
+        Section(
+            "Measured torques",
+            "A good controller makes the position right whatever the model lacks; the torque that "
+            "it had to give then tells. Two torques of the model are held against the measured "
+            "one: the torque that the recorded motion takes in the model (inverse dynamics), and "
+            "the torque that its actuators give for the recorded commands.\n\n"
+            "Where the first differs, friction, mass or load is wrong; where the second differs, "
+            "the actuators are.",
+            tables=[
+                Table(
+                    columns,
+                    rows,
+                    "Measured: root mean square. Motion, actuators: root mean square difference. "
+                    "Fit: 100 % is the same torque, 0 % is no better than the mean.",
+                )
+            ],
+        )
+    ]
+
+
+def _lag(name: str, lag: float) -> str:
+    return f"{name}: {1000 * lag + 0.0:.0f} ms" if np.isfinite(lag) else f"{name}: not seen"
+
+
+def _correlations(residuals: Residuals) -> go.Figure:
+    drawn = sorted(residuals.whiteness, key=lambda w: -w.outside)[:MOST_DRAWN]
+    figure = go.Figure()
+    for whiteness, colour in zip(drawn, COLOURS, strict=False):
+        figure.add_scatter(
+            x=[1000 * s for s in whiteness.seconds],
+            y=list(whiteness.correlation),
+            name=whiteness.signal,
+            mode="lines+markers",
+            line={"color": colour, "width": 1.8},
+            marker={"size": 5},
+        )
+    figure = styled(figure, height=300)
+    for bound in sorted({b for w in drawn for b in (w.bound, -w.bound)}):
+        figure.add_hline(bound, line={"color": SOFT, "width": 1.5, "dash": "dot"})
+    figure.update_xaxes(title_text="lag [ms]", rangemode="tozero")
+    return figure.update_yaxes(title_text="correlation", range=[-1.05, 1.05])

@@ -1,0 +1,91 @@
+"""Compare measured joint torques with the model's: a closed loop hides errors in position.
+
+A controller that tracks well makes the position right whatever the model lacks; the torque that it
+had to give for that is then wrong.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from garat_jax.diagnosis.localise import missing_torque
+from garat_jax.diagnosis.measurements import Recording, torques
+
+
+@dataclasses.dataclass(frozen=True)
+class TorqueError:
+    """How a joint's measured torque and the model's differ.
+
+    Attributes:
+        joint: The joint.
+        unit: N m or N.
+        measured_rms: Root mean square of the measured torque.
+        actuator_rmse: Against what the model's actuators give for the recorded commands.
+        actuator_fit_percent: The same as 100 (1 - |τ - τ̂| / |τ - mean τ|).
+        motion_rmse: Against what the model needs for the recorded motion (inverse dynamics).
+        motion_fit_percent: The same in per cent.
+    """
+
+    joint: str
+    unit: str
+    measured_rms: float
+    actuator_rmse: float
+    actuator_fit_percent: float
+    motion_rmse: float
+    motion_fit_percent: float
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong, in words."""
+        return (
+            f"{self.joint}: measured {self.measured_rms:.3g} {self.unit} rms; off by "
+            f"{self.motion_rmse:.3g} {self.unit} from what the motion takes in the model, and by "
+            f"{self.actuator_rmse:.3g} {self.unit} from what its actuators give"
+        )
+
+
+def compare_torques(
+    model: mujoco.MjModel, recordings: Sequence[Recording]
+) -> tuple[TorqueError, ...]:
+    """Compare every measured torque with the model's, smoothed alike; empty without any.
+
+    Args:
+        model: The compiled model, native fields as its effects leave them.
+        recordings: What was measured.
+    """
+    found = []
+    for signal in torques(model):
+        joint = signal.name.partition(".")[2]
+        dof = int(model.jnt_dofadr[model.joint(joint).id])
+        rows = [
+            _of_recording(model, recording, joint, dof)
+            for recording in recordings
+            if joint in recording.torque
+        ]
+        if rows:
+            measured, given, needed = (np.concatenate(c) for c in zip(*rows, strict=True))
+            of_actuator, of_motion = _error(measured, given), _error(measured, needed)
+            rms = float(np.sqrt(np.mean(measured**2)))
+            found.append(TorqueError(joint, signal.unit, rms, *of_actuator, *of_motion))
+    return tuple(found)
+
+
+def _of_recording(model: mujoco.MjModel, recording: Recording, joint: str, dof: int):
+    """Return measured, given and needed torque along a recording, [M] each."""
+    parts = []
+    for a, b in recording.spans:
+        span = dataclasses.replace(recording, spans=((a, b),))
+        m = missing_torque(model, [span])
+        measured = np.interp(m.time, recording.time[a:b], recording.torque[joint][a:b])
+        given = m.command[:, dof]
+        parts.append((measured, given, given + m.torque[:, dof]))
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def _error(measured: np.ndarray, modelled: np.ndarray) -> tuple[float, float]:
+    """Return the root mean square error and the fit in per cent."""
+    rest = float(np.linalg.norm(measured - modelled))
+    spread = float(np.linalg.norm(measured - measured.mean())) or 1e-12
+    return rest / len(measured) ** 0.5, 100 * (1 - rest / spread)

@@ -1,0 +1,56 @@
+"""Measured torques: equal ones fit, friction that a controller hides in position shows."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.torque import compare_torques
+from tests import models
+
+SERVO = models.PENDULUM.replace("<motor", '<position kp="400" kv="20"').replace(
+    'ctrlrange="-3 3" ctrllimited="true"', ""
+)
+
+
+def track(friction):
+    """A stiff servo follows a sine; the torque that it gives is measured."""
+    spec = models.spec(SERVO)
+    spec.joints[0].frictionloss = friction
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rows = []
+    for k in range(2000):
+        data.ctrl[0] = 0.5 * np.sin(2.0 * k * model.opt.timestep)
+        mujoco.mj_step1(model, data)
+        state = data.time, data.qpos[0], data.qvel[0], data.ctrl[0]
+        mujoco.mj_step2(model, data)
+        rows.append((*state, data.qfrc_actuator[0]))
+    time, qpos, qvel, ctrl, torque = np.asarray(rows).T
+    return Recording(
+        "made.csv", time, qpos[:, None], qvel[:, None], ctrl[:, None], {"hinge": torque}, True,
+        ((0, len(time)),), (),
+    )  # fmt: skip
+
+
+def test_the_true_model_gives_the_measured_torque():
+    model = models.spec(SERVO).compile()
+    (error,) = compare_torques(model, [track(0.0)])
+    assert (error.joint, error.unit) == ("hinge", "N m")
+    assert error.motion_fit_percent > 97
+    assert error.actuator_fit_percent > 97
+
+
+def test_hidden_friction_shows_in_the_torque_of_the_motion():
+    model = models.spec(SERVO).compile()
+    (error,) = compare_torques(model, [track(0.3)])
+    assert error.motion_rmse == pytest.approx(0.3, rel=0.1)
+    assert error.actuator_rmse < 0.05
+    assert "from what the motion takes in the model" in error.sentence
+
+
+def test_without_measured_torques_there_is_nothing_to_compare():
+    model = models.spec(SERVO).compile()
+    assert compare_torques(model, [dataclasses.replace(track(0.0), torque={})]) == ()
