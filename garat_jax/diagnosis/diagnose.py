@@ -58,7 +58,7 @@ def diagnose(
     grid = choose_grid(everything, host.opt.timestep)
     simulator = Simulator(model, candidates, grid)
     say("choosing the horizon")
-    horizon, segments = choose_horizon(simulator, everything, grid)
+    horizon, segments = choose_horizon(Simulator(model, (), grid), everything, grid)
     sample = grid.interval * grid.per_sample
     finer = Simulator(model, candidates, grid, refine=2)
     problem = Problem(simulator, finer, segments, segments.recording < len(fitted), sample)

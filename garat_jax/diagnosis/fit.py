@@ -48,6 +48,11 @@ class Problem:
     fitted: np.ndarray
     interval: float
 
+    def take(self, chosen: np.ndarray) -> "Problem":
+        """Return the problem of some of the segments."""
+        segments = self.segments.take(chosen)
+        return dataclasses.replace(self, segments=segments, fitted=self.fitted[chosen])
+
     def whiten(self, predicted: np.ndarray) -> np.ndarray:
         """Return whitened residuals [..., S, N] of predictions [..., S, L, num_signals]."""
         s = self.segments

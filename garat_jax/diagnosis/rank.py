@@ -28,6 +28,8 @@ TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 CONTENDERS = 4
 """How many candidates are fitted each round, besides those that are like the first."""
+CONTENDER_STEPS = 6
+"""Gauss-Newton steps of a contender, which starts where screening expects it."""
 ROUNDS = 5
 RESAMPLES = 500
 
@@ -155,10 +157,12 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
     adequate = not is_above(problem, metric, before, floor)
     current, steps, first_round = before, [], ()
     for number in range(ROUNDS):
+        gap = is_above(problem, metric, current, floor)
+        if number and not gap:
+            break
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}")
         scores = screen(problem, current, held)
-        gap = is_above(problem, metric, current, floor)
         contenders = _fit_contenders(problem, current, scores, say) if gap else []
         judged = _judge(problem, metric, current, scores, contenders, gap)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
@@ -193,7 +197,7 @@ def _fit_with(problem: Problem, current: Fit, score: Score) -> Fit:
     """Fit the selected effects and one more, from where screening puts it."""
     theta = current.theta.copy()
     theta[list(score.start)] = list(score.start.values())
-    return fit(problem, theta, current.start, (*current.free, *score.columns))
+    return fit(problem, theta, current.start, (*current.free, *score.columns), CONTENDER_STEPS)
 
 
 def _block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):

@@ -57,12 +57,10 @@ class Replay:
 
     def only(self, recordings: Sequence[int]) -> "Replay":
         """Return the part of some recordings, by number; spreads are those within them."""
-        s = self.segments
-        kept = np.isin(s.recording, list(recordings))
-        by_segment = ("measured", "weight", "start", "ctrl", "place", "recording", "first")
-        parts = {name: getattr(s, name)[kept] for name in by_segment}
-        spread = parts["measured"][parts["weight"] > 0].std(axis=0) + 1e-12
-        segments = dataclasses.replace(s, **parts, spread=spread)
+        kept = np.isin(self.segments.recording, list(recordings))
+        segments = self.segments.take(kept)
+        spread = segments.measured[segments.weight > 0].std(axis=0) + 1e-12
+        segments = dataclasses.replace(segments, spread=spread)
         return dataclasses.replace(self, segments=segments, predicted=self.predicted[kept])
 
     def sizes(self) -> dict[str, Size]:

@@ -27,6 +27,8 @@ from garat_jax.diagnosis.simulate import Simulator
 
 EQUIVALENT = 0.95
 """Cosine of two candidates' contributions above which the recordings cannot tell them apart."""
+SCREENED = 24
+"""Segments that are screened at least, evenly chosen; scores take many simulations each."""
 VISIBLE = 3.0
 """Whitened change over a parameter's whole range below which the data cannot show it."""
 WORTHWHILE = 0.01
@@ -127,8 +129,11 @@ def screen(problem: Problem, fit: Fit, skip: Sequence[int] = ()) -> list[Score]:
         fit: The current fit.
         skip: Indices of effects that are in the model already.
     """
+    fitted = np.flatnonzero(problem.fitted)
+    chosen = fitted[:: max(1, len(fitted) // SCREENED)]
+    problem, start = problem.take(chosen), fit.start[chosen]
     rows, trials = _plan(problem.simulator, fit.theta, skip)
-    sensitivities = _measure(problem, fit, rows, trials)
+    sensitivities = _measure(problem, fit, start, rows, trials)
     raw: dict[int, Score] = {}
     for trial in trials:
         score = _score(problem, sensitivities, rows, trial)
@@ -187,20 +192,19 @@ def _step_within(simulator: Simulator, column: int, value: float) -> float:
     return p.scale if value + p.scale <= p.high else -p.scale
 
 
-def _measure(problem: Problem, fit: Fit, rows: list[_Row], trials: list[_Trial]) -> _Sensitivities:
-    simulator, segments, fitted = problem.simulator, problem.segments, problem.fitted
+def _measure(problem: Problem, fit: Fit, start, rows, trials: list[_Trial]) -> _Sensitivities:
+    simulator, segments = problem.simulator, problem.segments
     steps = difference_steps(problem, fit.theta, fit.free, 1e-2)
-    lin = linearise(problem, fit.theta, fit.start, fit.free, steps)
+    lin = linearise(problem, fit.theta, start, fit.free, steps)
     thetas = np.tile(fit.theta, (len(rows), 1))
     for theta, row in zip(thetas, rows, strict=True):
         theta[list(row.values)] = list(row.values.values())
-    moved = problem.whiten_change(simulator.linear_change(thetas, fit.theta, fit.start, segments))
+    moved = problem.whiten_change(simulator.linear_change(thetas, fit.theta, start, segments))
     below = [moved[row.below] if row.below >= 0 else 0.0 for row in rows]
     changes = np.stack([change - other for change, other in zip(moved, below, strict=True)])
-    integrator = problem.integrator_error(fit.theta, fit.start, lin.residual)
-    nuisances = np.stack([integrator, *_offsets(problem)])
-    remove = _Remover(lin, fitted)
-    changes, nuisances = remove(changes), remove(nuisances)
+    integrator = problem.integrator_error(fit.theta, start, lin.residual)
+    remove = _Remover(lin)
+    changes, nuisances = remove(changes), remove(np.stack([integrator, *_offsets(problem)]))
     delays = [t for t in trials if simulator.effects[t.effect].kind in DELAYS]
     common = [t for t in delays if simulator.effects[t.effect].target == "all"] or delays[:1]
     return _Sensitivities(
@@ -209,7 +213,7 @@ def _measure(problem: Problem, fit: Fit, rows: list[_Row], trials: list[_Trial])
         delay=changes[:, [t.rows[0] for t in common[:1]]],
         offsets=nuisances[:, 1:],
         integrator=nuisances[:, :1],
-        labels=block_labels(problem)[fitted].ravel(),
+        labels=block_labels(problem).ravel(),
     )
 
 
@@ -225,14 +229,12 @@ def _offsets(problem: Problem) -> np.ndarray:
 class _Remover:
     """Removes what initial states and free parameters explain from columns [k, S, N]."""
 
-    def __init__(self, lin: Linearisation, fitted: np.ndarray):
-        self._fitted = fitted
-        self._space = StartSpace(lin.start[fitted])
-        free = self._space.remove(lin.parameters[fitted])
-        self._free = _orthonormal(_tall(free))
+    def __init__(self, lin: Linearisation):
+        self._space = StartSpace(lin.start)
+        self._free = _orthonormal(_tall(self._space.remove(lin.parameters)))
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
-        rest = self._space.remove(np.moveaxis(columns[:, self._fitted], 0, -1))
+        rest = self._space.remove(np.moveaxis(columns, 0, -1))
         return _without(_tall(rest), self._free)
 
 
@@ -265,11 +267,11 @@ def _score(problem: Problem, s: _Sensitivities, rows: list[_Row], trial: _Trial)
     width = np.asarray([p.high - p.low for p in slots]) if trial.is_only else steps
     seen = norm * np.maximum(width / steps, 1.0) > VISIBLE
     seen &= norm > 1e-3 * norm.max(initial=0.0)
-    if not seen[0]:
-        reason = f"the recordings do not excite it: its {slots[0].name} changes no signal"
+    given = [k for k, i in enumerate(chosen) if rows[i].column in trial.start]
+    if unseen := [slots[k].name for k in (0, *given) if not seen[k]]:
+        reason = f"the recordings do not excite it: its {unseen[0]} changes no signal"
         columns = tuple(rows[i].column for i in chosen)
         return Score(trial.effect, columns, (), {}, 0.0, 1.0, False, matrix[:, 0], reason)
-    given = [k for k, i in enumerate(chosen) if rows[i].column in trial.start and seen[k]]
     needed = _needed(matrix, s.residual, seen, given)
     chosen, matrix = [chosen[i] for i in needed], matrix[:, needed]
     factor = np.linalg.lstsq(matrix, -s.residual, rcond=1e-6)[0]

@@ -52,6 +52,12 @@ class Segments:
     noise: np.ndarray
     spread: np.ndarray
 
+    def take(self, chosen: np.ndarray) -> "Segments":
+        """Return some of the segments; noise and spread stay those of all."""
+        by_segment = ("measured", "weight", "start", "ctrl", "place", "recording", "first")
+        parts = {name: getattr(self, name)[chosen] for name in by_segment}
+        return dataclasses.replace(self, **parts)
+
 
 @dataclasses.dataclass(frozen=True)
 class Grid:

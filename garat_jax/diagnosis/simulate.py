@@ -19,8 +19,8 @@ from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
 from garat_jax.dynamics import Override
 from garat_jax.effects import Effect, Parameter
 
-BATCH_SIZES = (1, 4, 16)
-"""Each width of a batch is compiled once, so widths are rounded up to one of these."""
+BATCH_SIZES = (256, 1024)
+"""Simulations in a batch; each size is compiled once."""
 
 
 class Slot(NamedTuple):
@@ -106,7 +106,7 @@ class Simulator:
         for rows in (np.flatnonzero(at_once), np.flatnonzero(~at_once)):
             if len(rows):
                 run = self._program(theta[rows])
-                result[rows] = self._in_parts(run, segments, theta[rows], start[rows])[0]
+                result[rows] = self._in_batches(run, segments, theta[rows], start[rows])[0]
         return result
 
     def linear_change(
@@ -126,27 +126,32 @@ class Simulator:
         Returns:
             Changes of the predictions, [P, S, L, num_signals].
         """
-        moved = [set(self._owner[row != base].tolist()) for row in theta]
-        kinds = [{self.effects[i].kind for i in effects} for effects in moved]
-        cheap = np.asarray([self._any_at_once and m <= {*self._blind, *self._along} for m in moved])
-        looks = cheap & np.asarray([not m <= {*self._blind} for m in moved])
-        starts = np.broadcast_to(start, (len(theta), *start.shape))
-        now, path = self._in_parts(self._program(base[None]), segments, base[None], start[None])
         result = np.empty((len(theta), *segments.measured.shape))
-        exact = np.flatnonzero(~looks)
-        for kind in dict.fromkeys(k for i in exact for k in kinds[i]):
-            rows = [i for i in exact if kind in kinds[i] and not cheap[i]]
-            if rows:
-                result[rows] = self.predict(theta[rows], starts[rows], segments) - now
-        rows = np.flatnonzero(cheap & ~looks)
-        result[rows] = self.predict(theta[rows], starts[rows], segments) - now
-        rows = np.flatnonzero(looks)
-        if len(rows):
-            run = self._jitted(("along", ()), self._predict_along, 3)
+        now, path = self._in_batches(self._program(base[None]), segments, base[None], start[None])
+        for way, rows in self._ways(theta, base).items():
+            starts = np.broadcast_to(start, (len(rows) + 1, *start.shape))
+            if way != "along":
+                result[rows] = self.predict(theta[rows], starts[1:], segments) - now
+                continue
+            run = self._jitted(("along", ()), self._predict_along)
             both = np.concatenate([base[None], theta[rows]])
-            changed = self._in_parts(run, segments, both, starts[: len(both)], path[0])[0]
+            changed, _ = self._in_batches(run, segments, both, starts, path[0])
             result[rows] = changed[1:] - changed[0]
         return result
+
+    def _ways(self, theta: np.ndarray, base: np.ndarray) -> dict[str, list[int]]:
+        """Sort rows by how their change is had: "at once", "along", or a kind that is stepped."""
+        ways: dict[str, list[int]] = {}
+        for i, row in enumerate(theta):
+            moved = set(self._owner[row != base].tolist())
+            if self._any_at_once and moved <= {*self._blind}:
+                way = "at once"
+            elif self._any_at_once and moved <= {*self._blind, *self._along}:
+                way = "along"
+            else:
+                way = " ".join(sorted({self.effects[j].kind for j in moved}))
+            ways.setdefault(way, []).append(i)
+        return ways
 
     def _is_at_once(self, theta: np.ndarray) -> bool:
         acting = set(self._owner[theta != self.base].tolist())
@@ -155,30 +160,39 @@ class Simulator:
     def _program(self, thetas: np.ndarray) -> Callable:
         """Return the compiled program for parameters [P, num_parameters] that go together."""
         if all(self._is_at_once(theta) for theta in thetas):
-            return self._jitted(("at once", ()), self._predict_at_once, 2)
+            return self._jitted(("at once", ()), self._predict_at_once)
         acting = self._owner[np.any(thetas != self.base, axis=0)]
         chosen = tuple(int(i) for i in np.unique(acting))
-        return self._jitted(("stepped", chosen), functools.partial(self._predict, chosen), 2)
+        return self._jitted(("stepped", chosen), functools.partial(self._predict, chosen))
 
-    def _jitted(self, key, function, num_by_segment: int) -> Callable:
+    def _jitted(self, key, function) -> Callable:
         if key not in self._programs:
-            by_segment = (None, 0) + (0,) * num_by_segment
-            by_row = (0, 0) + (None,) * num_by_segment
-            self._programs[key] = jax.jit(jax.vmap(jax.vmap(function, by_segment), by_row))
+            self._programs[key] = jax.jit(jax.vmap(function))
         return self._programs[key]
 
-    def _in_parts(self, run, segments: Segments, theta, start, *more):
-        """Run a program on rows [P] in batches of a width that is compiled once."""
-        widest = next((w for w in BATCH_SIZES if w >= len(theta)), BATCH_SIZES[-1])
+    def _in_batches(self, run, segments: Segments, theta, start, path=None):
+        """Run a program for rows [P] and segments [S]; return signals and paths [P, S, ..].
+
+        Rows and segments together are cut into batches of a size that is compiled once.
+        """
+        num_rows, num_segments = start.shape[:2]
+        total = num_rows * num_segments
+        size = BATCH_SIZES[0] if total <= 2 * BATCH_SIZES[0] else BATCH_SIZES[1]
+        starts = start.reshape(total, -1)
         found, paths = [], []
-        for first in range(0, len(theta), widest):
-            rows = np.minimum(np.arange(first, first + widest), len(theta) - 1)
-            kept = slice(0, len(theta) - first)
+        for first in range(0, total, size):
+            chosen = np.minimum(np.arange(first, first + size), total - 1)
+            row, segment = chosen // num_segments, chosen % num_segments
+            more = () if path is None else (path[segment],)
+            inputs = (theta[row], starts[chosen], segments.ctrl[segment], segments.place[segment])
             with jax.enable_x64(True):
-                result = run(theta[rows], start[rows], segments.ctrl, segments.place, *more)
-                found.append(np.asarray(result[0])[kept, ..., : segments.measured.shape[2]])
-                paths.append(result[1])
-        return np.concatenate(found), paths[0]
+                signals, true = run(*inputs, *more)
+                found.append(np.asarray(signals)[..., : segments.measured.shape[2]])
+                paths.append(np.asarray(true))
+        return tuple(
+            np.concatenate(parts)[:total].reshape(num_rows, num_segments, *parts[0].shape[1:])
+            for parts in (found, paths)
+        )
 
     def with_parameters(self, theta) -> tuple[Effect, ...]:
         """Return the candidate effects with the values of `theta`, [num_parameters]."""
