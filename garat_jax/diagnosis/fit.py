@@ -176,7 +176,7 @@ def difference_steps(problem: Problem, theta: np.ndarray, columns, relative: flo
     steps = []
     for j in columns:
         p = problem.simulator.slots[j].parameter
-        size = relative * max(p.scale, 0.1 * abs(theta[j] - p.nominal))
+        size = relative * max(p.scale, 0.1 * min(abs(theta[j] - p.nominal), abs(theta[j])))
         steps.append(size if theta[j] + size <= p.high else -size)
     return np.asarray(steps)
 

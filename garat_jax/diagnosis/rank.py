@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from garat_jax.diagnosis.contend import Contender, fit_contenders
 from garat_jax.diagnosis.fit import Fit, Problem, StartSpace, block_labels, fit, linearise, settle
 from garat_jax.diagnosis.results import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, screen
@@ -26,10 +27,6 @@ STABLE = 0.8
 """Share of block resamples in which an effect must be first."""
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
-CONTENDERS = 4
-"""How many candidates are fitted each round, besides those that are like the first."""
-CONTENDER_STEPS = 6
-"""Gauss-Newton steps of a contender, which starts where screening expects it."""
 ROUNDS = 5
 RESAMPLES = 500
 
@@ -57,19 +54,6 @@ class Metric(NamedTuple):
         num_signals = len(self.spread)
         squares = (residual[chosen] ** 2 * self.counted[chosen]).reshape(-1, num_signals)
         return np.sqrt(squares.sum(axis=0) / self.counted[chosen].sum() * num_signals)
-
-
-@dataclasses.dataclass(frozen=True)
-class Contender:
-    """A candidate that was fitted.
-
-    Attributes:
-        score: What screening said.
-        fit: All selected effects and this one, fitted.
-    """
-
-    score: Score
-    fit: Fit
 
 
 class Step(NamedTuple):
@@ -163,7 +147,7 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}")
         scores = screen(problem, current, held)
-        contenders = _fit_contenders(problem, current, scores, say) if gap else []
+        contenders = fit_contenders(problem, current, scores, say) if gap else []
         judged = _judge(problem, metric, current, scores, contenders, gap)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         candidate, contender = judged[0] if judged else (None, None)
@@ -176,28 +160,6 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
     selected = tuple(_refreshed(problem, step, current) for step in steps)
     candidates = _without_superfluous(first_round, selected)
     return Outcome(before, current, candidates, tuple(steps), selected, floor.error, adequate)
-
-
-def _fit_contenders(problem, current: Fit, scores: Sequence[Score], say) -> list[Contender]:
-    likely = [s for s in scores if not s.excluded and s.possible and s.share > 0.02]
-    likely = [s for s in likely if s.share > 0.25 * likely[0].share]
-    if not likely:
-        return []
-    chosen = likely[:CONTENDERS]
-    chosen += [s for s in likely[CONTENDERS:] if cosine(s, likely[0]) > EQUIVALENT]
-    contenders = []
-    for score in chosen:
-        effect = problem.simulator.effects[score.effect]
-        say(f"fitting {effect.kind} at {effect.target}")
-        contenders.append(Contender(score, _fit_with(problem, current, score)))
-    return contenders
-
-
-def _fit_with(problem: Problem, current: Fit, score: Score) -> Fit:
-    """Fit the selected effects and one more, from where screening puts it."""
-    theta = current.theta.copy()
-    theta[list(score.start)] = list(score.start.values())
-    return fit(problem, theta, current.start, (*current.free, *score.columns), CONTENDER_STEPS)
 
 
 def _block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):
@@ -305,7 +267,7 @@ def _gain(problem, metric: Metric, before: Fit, after: Fit, held_out) -> Interva
 
 
 def _estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate]:
-    """Return the fitted parameters of an effect, and those that keep another than their nominal."""
+    """Return the fitted parameters of an effect, and those set to another than no effect's."""
     simulator = problem.simulator
     estimates = {}
     for j, slot in enumerate(simulator.slots):
@@ -316,7 +278,7 @@ def _estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate
             at = fitted.free.index(j)
             low, high = float(fitted.low[at]), float(fitted.high[at])
             estimates[slot.parameter.name] = Estimate(float(fitted.theta[j]), low, high, unit)
-        elif fitted.theta[j] != slot.parameter.nominal:
+        elif fitted.theta[j] != slot.base:
             value = float(fitted.theta[j])
             estimates[slot.parameter.name] = Estimate(value, float("nan"), float("nan"), unit)
     return estimates

@@ -29,6 +29,21 @@ EXPERIMENTS: dict[frozenset[str], str] = {
     frozenset({"torque_offset", "gravity_scale"}): (
         "rest in poses on both sides of the vertical: an offset keeps its sign, gravity changes it"
     ),
+    frozenset({"torque_offset", "encoder_offset"}): (
+        "swing widely under gravity: gravity depends on the true angle, a constant torque does not"
+    ),
+    frozenset({"actuator_delay", "sensor_delay"}): (
+        "push it by hand, or add a second, faster sensor: commands and sensors are late together"
+    ),
+    frozenset({"viscous_damping", "quadratic_drag"}): (
+        "repeat the same motion at two amplitudes: viscous friction doubles, drag quadruples"
+    ),
+    frozenset({"viscous_damping", "back_emf"}): (
+        "let it swing with the motor disconnected: back-EMF vanishes, damping stays"
+    ),
+    frozenset({"joint_stiffness", "gravity_scale"}): (
+        "turn the mechanism on its side: a spring stays, gravity changes"
+    ),
 }
 """By pairs of kinds."""
 DEFAULT = (

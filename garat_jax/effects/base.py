@@ -140,6 +140,8 @@ class Effect(abc.ABC):
     """Whether `sense` does anything: the effect is one of sensors, not of the motion."""
     notes: ClassVar[bool] = False
     """Whether `note` does anything: what is reported depends on states of some time ago."""
+    refines: ClassVar[tuple[str, ...]] = ()
+    """Kinds that are this law with parameters left out; they come first where they do as well."""
     independent: ClassVar[bool] = False
     """Whether every parameter acts alone; otherwise the first one switches the others on."""
 

@@ -151,6 +151,8 @@ class AsymmetricFriction(Effect):
     """
 
     kind: ClassVar[str] = "asymmetric_friction"
+    refines: ClassVar[tuple[str, ...]] = ("coulomb_friction", "viscous_damping")
+    independent: ClassVar[bool] = True
     elements: ClassVar[tuple[str, ...]] = ("joint",)
     law: ClassVar[str] = "τ = −(τ₊ + c₊·q̇) for q̇ > 0, τ₋ − c₋·q̇ for q̇ < 0"
     identified_by: ClassVar[str] = "constant-speed runs in both directions, and rests between them"
@@ -238,6 +240,7 @@ class StribeckFriction(Effect):
     """
 
     kind: ClassVar[str] = "stribeck_friction"
+    refines: ClassVar[tuple[str, ...]] = ("coulomb_friction",)
     elements: ClassVar[tuple[str, ...]] = ("joint",)
     law: ClassVar[str] = "|τ| = τ_c + (τ_s − τ_c)·exp(−(q̇/v_s)²), against the motion"
     identified_by: ClassVar[str] = "constant-speed runs from below v_s up; slow ramps from rest"
