@@ -6,7 +6,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from garat_jax.commands.console import check_files, check_optional, make_run, say
+from garat_jax.commands.console import check_files, check_optional, check_out, make_run, say
+from garat_jax.errors import UserError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,3 +76,84 @@ class Diagnose:
         with make_run(self, out) as run:
             run_diagnose(self.model, self.data, self.holdout, run, self.map, catalogue)
         say(f"report: {run.root / 'report.html'}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Improve:
+    """Repair a model: diagnose, add what is missing, repeat until nothing more is certain.
+
+    It writes DIR/model.toml with the model's files beside it, DIR/improve.json and DIR/report.html.
+    """
+
+    model: Annotated[Positional[Path], arg(metavar="MODEL")]
+    """MJCF (.xml) or model card (.toml)."""
+    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA...")]
+    """Recordings (CSV, Parquet or NPZ), one a file."""
+    holdout: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
+    """Recordings to prove the result on; by default some of DATA are held out."""
+    map: Annotated[Path | None, arg(metavar="MAP.toml")] = None
+    """How the recordings' columns are named, and in which units."""
+    effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
+    """Python files with effects of your own."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for the results; runs/improve-MODEL by default."""
+    force: bool = False
+    """Replace an earlier run in DIR."""
+
+    def run(self) -> None:
+        """Repair the model."""
+        check_files([self.model], "MODEL")
+        check_files(self.data, "DATA")
+        check_files(self.holdout or self.data, "--holdout")
+        check_optional(self.map, "--map")
+        from garat_jax.diagnosis.improve import run_improve
+        from garat_jax.effects.catalogue import load_catalogue
+
+        catalogue = load_catalogue(self.effects)
+        out = self.out or Path("runs") / f"improve-{self.model.stem}"
+        with make_run(self, out) as run:
+            done = run_improve(self.model, self.data, self.holdout, run, self.map, catalogue)
+        say(str(done))
+        say(f"model card: {run.root / 'model.toml'} {done.card}")
+        say(f"report: {run.root / 'report.html'}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Plan an excitation, within the actuators' limits, that tells two effects apart."""
+
+    model: Annotated[Positional[Path], arg(metavar="MODEL")]
+    """MJCF (.xml) or model card (.toml)."""
+    separate: Annotated[tuple[str, str], arg(metavar="A B")]
+    """Two effects, each KIND or KIND@TARGET."""
+    out: Annotated[Path, arg(metavar="FILE.csv")]
+    """The commands to play: time and ctrl.ACTUATOR."""
+    seconds: float = 8.0
+    """Length of the excitation."""
+    seed: int = 0
+    """Draws the excitations that are tried."""
+    effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
+    """Python files with effects of your own."""
+    force: bool = False
+    """Replace FILE.csv."""
+
+    def run(self) -> None:
+        """Plan the excitation."""
+        check_files([self.model], "MODEL")
+        check_out(self.out, ".csv", self.force)
+        if not 2.0 <= self.seconds <= 600.0:
+            raise UserError(f"--seconds {self.seconds:g}: expected 2 to 600")
+        from garat_jax.diagnosis import load_model
+        from garat_jax.diagnosis.compare import tell
+        from garat_jax.diagnosis.plan import parse_place, plan, write_plan
+        from garat_jax.effects.catalogue import load_catalogue
+
+        model = load_model(self.model, load_catalogue(self.effects))
+        first, second = (parse_place(text, model) for text in self.separate)
+        planned = plan(model, first, second, self.seconds, self.seed, tell)
+        write_plan(planned, model, self.out)
+        say(
+            f"{first} and {second}: cosine {planned.before:.3f} under a plain sine, "
+            f"{planned.after:.3f} under {planned.family} (1: no recording can tell them apart)"
+        )
+        say(f"excitation: {self.out}")

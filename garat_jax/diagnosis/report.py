@@ -16,6 +16,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.report_data import (
     recordings_section,
+    repeatability_section,
     residuals_section,
     torque_section,
 )
@@ -112,6 +113,7 @@ def diagnosis_sections(
         *_ranking(diagnosis),
         *_ladder(diagnosis),
         *_parameters(diagnosis, model),
+        *repeatability_section(diagnosis.repeatability),
         *_next(diagnosis),
     ]
 

@@ -7,6 +7,7 @@ import plotly.graph_objects as go
 
 from garat_jax.diagnosis.quality import Quality
 from garat_jax.diagnosis.residuals import Residuals
+from garat_jax.diagnosis.results import Repeated
 from garat_jax.diagnosis.torque import TorqueError
 from garat_jax.report import COLOURS, SOFT, Figure, Section, Table, styled
 
@@ -149,6 +150,39 @@ def torque_section(torques: Sequence[TorqueError]) -> list[Section]:
             ],
         )
     ]
+
+
+def repeatability_section(repeated: Sequence[Repeated]) -> list[Section]:
+    """Return whether each recording alone shows the same size; nothing without an effect."""
+    if not repeated:
+        return []
+    rows = [
+        (
+            f"{r.effect.replace('_', ' ')} at {r.target}",
+            f"{r.parameter} [{r.unit}]" if r.unit not in ("", "1") else r.parameter,
+            s.recording,
+            s.estimate,
+            s.low,
+            s.high,
+        )
+        for r in repeated
+        for s in r.recordings
+    ]
+    lines = []
+    for r in repeated:
+        name = f"{r.parameter} of {r.effect.replace('_', ' ')} at {r.target}"
+        if r.agree:
+            lines.append(f"- {name}: the recordings agree within their intervals.")
+        else:
+            lines.append(
+                f"- {name}: the recordings differ by more than their intervals allow "
+                f"(p = {r.p_value:.2g}); the effect may change with time, temperature or load, or "
+                "stand in for another one."
+            )
+    columns = ["effect", "parameter", "recording", "estimate", "low", "high"]
+    caption = "Each recording fitted alone, with its 95 % interval; – where it does not show it."
+    text = "\n".join(lines)
+    return [Section("The same in every recording?", text, tables=[Table(columns, rows, caption)])]
 
 
 def _lag(name: str, lag: float) -> str:

@@ -115,6 +115,39 @@ class Experiment:
 
 
 @dataclasses.dataclass(frozen=True)
+class Sighting:
+    """A parameter with its 95 % interval as one recording alone shows it; NaN where it does not."""
+
+    recording: str
+    estimate: float
+    low: float
+    high: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Repeated:
+    """One parameter of an effect that was found, recording by recording.
+
+    Attributes:
+        effect: The effect's kind.
+        target: Where it acts.
+        parameter: The parameter.
+        unit: Its unit.
+        recordings: What each recording shows.
+        p_value: Probability of such differences if the size is the same in all (Cochran's Q).
+        agree: Whether that is not improbable.
+    """
+
+    effect: str
+    target: str
+    parameter: str
+    unit: str
+    recordings: tuple[Sighting, ...]
+    p_value: float
+    agree: bool
+
+
+@dataclasses.dataclass(frozen=True)
 class Diagnosis:
     """Where a model fails and which effect it is missing; fields as in diagnosis.json."""
 
@@ -130,6 +163,7 @@ class Diagnosis:
     selected: tuple[Candidate, ...]
     ladder: tuple[Rung, ...]
     next_experiment: Experiment | None
+    repeatability: tuple[Repeated, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json; what is not finite is null."""

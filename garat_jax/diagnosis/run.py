@@ -1,5 +1,6 @@
 """The command `garat diagnose`: read the files, diagnose, write diagnosis.json and report.html."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,6 +10,7 @@ from rich.console import Console
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.model_card import load_model
+from garat_jax.diagnosis.repeat import repeatability
 from garat_jax.diagnosis.report import diagnosis_sections, write_diagnosis
 from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.effects import CATALOGUE
@@ -49,6 +51,8 @@ def run_diagnose(
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
     with Console(stderr=True).status("reading the recordings") as status:
         diagnosis = diagnose(loaded, recordings, held_out, status.update)
+        again = repeatability(loaded, recordings, held_out, diagnosis.selected, status.update)
+        diagnosis = dataclasses.replace(diagnosis, repeatability=again)
         run.write_json("diagnosis.json", diagnosis.to_json())
         status.update("writing the report")
         sections = diagnosis_sections(diagnosis, loaded, recordings, held_out)

@@ -102,7 +102,7 @@ class Simulator:
             Predictions, [P, S, L, num_signals]; not finite where a simulation diverged.
         """
         result = np.empty((len(theta), *segments.measured.shape))
-        at_once = np.asarray([self._is_at_once(row) for row in theta])
+        at_once = np.asarray([self._is_at_once(row) for row in theta], bool)
         for rows in (np.flatnonzero(at_once), np.flatnonzero(~at_once)):
             if len(rows):
                 run = self._program(theta[rows])

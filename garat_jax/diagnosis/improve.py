@@ -1,0 +1,226 @@
+"""Repair a model: diagnose, add what was found, repeat until nothing passes the gates."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from garat_jax import report
+from garat_jax.diagnosis.compare import read_recordings
+from garat_jax.diagnosis.diagnose import UNEXPLAINED, choose_horizon, diagnose, split, thin
+from garat_jax.diagnosis.export import copy_model
+from garat_jax.diagnosis.fit import Problem, settle
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model, load_model, save_card
+from garat_jax.diagnosis.rank import make_metric
+from garat_jax.diagnosis.repeat import found_theta, nominal_effects, repeatability
+from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosis_sections
+from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
+from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.view import repaired
+from garat_jax.effects import CATALOGUE
+from garat_jax.effects.catalogue import Catalogue
+from garat_jax.report import Reproduce, Section
+from garat_jax.runs import RunDirectory, finite_or_null, to_plain
+
+FORMAT = "garat-improve/1"
+ROUNDS = 4
+"""Most diagnoses in a row; the last one finds nothing, or the catalogue is used up."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Improvement:
+    """A repaired model and how it came about.
+
+    Attributes:
+        diagnosis: All rounds as one: the first one's view of the model, everything that was added,
+            the ladder over all of it at one horizon, and the last one's verdict on what is left.
+        rounds: Each diagnosis, the first of the model as it was.
+        model: The repaired model.
+    """
+
+    diagnosis: Diagnosis
+    rounds: tuple[Diagnosis, ...]
+    model: Model
+
+    @property
+    def card(self) -> str:
+        """What the model card adds, in words."""
+        added = [str(c.named) for c in self.diagnosis.selected]
+        return f"adds {' and '.join(added)}" if added else "is the model as it was"
+
+    def __str__(self) -> str:
+        lines = [self.diagnosis.sentence]
+        for rung in self.diagnosis.ladder:
+            added = f"+ {rung.added.named}" if rung.added else "the model as it is"
+            lines.append(f"  {added}: held-out error {rung.error_holdout:.4g}")
+        return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of improve.json."""
+        whole = self.diagnosis.to_json()
+        kept = ("model", "data", "holdout", "versions", "verdict", "error", "ladder")
+        return {
+            "format": FORMAT,
+            **{key: whole[key] for key in kept},
+            "added": whole["selected"],
+            "repeatability": whole["repeatability"],
+            "rounds": [found.to_json() for found in self.rounds],
+            "seconds": sum(found.seconds for found in self.rounds),
+        }
+
+
+def improve(
+    model: Model,
+    recordings: Sequence[Recording],
+    holdout: Sequence[Recording] = (),
+    say: Callable[[str], None] = lambda message: None,
+) -> Improvement:
+    """Add effects to a model until no further one passes the gates of a diagnosis.
+
+    Args:
+        model: The model.
+        recordings: What was measured.
+        holdout: Recordings to prove the result on; see `diagnose`.
+        say: Told what is being done.
+    """
+    current, rounds = model, []
+    for number in range(ROUNDS):
+        found = diagnose(
+            current,
+            recordings,
+            holdout,
+            lambda line, n=number: say(f"diagnosis {n + 1}: {line}"),
+        )
+        rounds.append(found)
+        if not found.selected:
+            break
+        current = repaired(current, found.selected)
+    added = tuple(c for found in rounds for c in found.selected)
+    say("measuring the ladder")
+    whole = _as_one(model, recordings, holdout, rounds, added)
+    again = repeatability(model, recordings, holdout, added, say)
+    return Improvement(dataclasses.replace(whole, repeatability=again), tuple(rounds), current)
+
+
+def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -> Diagnosis:
+    """Return all rounds as one diagnosis, its errors measured at one horizon."""
+    first, last = rounds[0], rounds[-1]
+    if not added:
+        return first
+    ladder, per_signal = _ladder(model, recordings, holdout, added)
+    before, after = ladder[0].error_holdout, ladder[-1].error_holdout
+    rest = float(np.sqrt(max(after**2 - first.error.noise_floor**2, 0.0)))
+    share = rest / before if before > 0 else 0.0
+    verdict: Verdict = "missing_effect"
+    if last.verdict == "unexplained" and share > UNEXPLAINED:
+        verdict = "unexplained"
+    error = dataclasses.replace(
+        first.error,
+        before=before,
+        after=after,
+        unexplained_share=share,
+        per_signal=_with_after(first.error, per_signal),
+    )
+    return dataclasses.replace(
+        first,
+        verdict=verdict,
+        error=error,
+        selected=added,
+        ladder=ladder,
+        next_experiment=last.next_experiment or first.next_experiment,
+    )
+
+
+def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
+    """Return a rung for each effect, at its final size, and each signal's error by their number."""
+    fitted, held_out, _ = split(recordings, holdout)
+    everything = thin((*fitted, *held_out))
+    grid = choose_grid(everything, model.compile(engine="mujoco").host.model.opt.timestep)
+    simulator = Simulator(model, nominal_effects(model, added), grid)
+    _, segments = choose_horizon(simulator, everything, grid)
+    seen = segments.recording < len(fitted)
+    problem = Problem(simulator, simulator, segments, seen, grid.interval * grid.per_sample)
+    metric = make_metric(problem)
+    final, start = found_theta(simulator, added), segments.start
+    owners = np.asarray([slot.effect for slot in simulator.slots])
+    rungs, by_signal = [], []
+    for count in range(len(added) + 1):
+        theta = np.where(owners < count, final, simulator.base)
+        settled = settle(problem, theta, start)
+        errors = metric.error(settled.residual, seen), metric.error(settled.residual, ~seen)
+        rungs.append(Rung(added[count - 1] if count else None, *errors))
+        by_signal.append(metric.by_signal(settled.residual, ~seen) * segments.noise)
+    return tuple(rungs), by_signal
+
+
+def _with_after(error: Errors, by_signal: Sequence[np.ndarray]) -> Mapping[str, Mapping[str, Any]]:
+    return {
+        name: {**row, "before": float(by_signal[0][i]), "after": float(by_signal[-1][i])}
+        for i, (name, row) in enumerate(error.per_signal.items())
+    }
+
+
+def run_improve(
+    model: Path,
+    data: Sequence[Path],
+    holdout: Sequence[Path],
+    run: RunDirectory,
+    columns: Path | None = None,
+    catalogue: Catalogue = CATALOGUE,
+) -> Improvement:
+    """Repair a model file with recordings; write model.toml, improve.json and report.html.
+
+    The model's own files are copied into `model/`, so that the run's folder is complete.
+
+    Args:
+        model: MJCF or model card.
+        data: Recordings to find the missing effects with.
+        holdout: Recordings to prove them on; some of `data` are held out if there are none.
+        run: Where to write.
+        columns: Map of the recordings' columns.
+        catalogue: The kinds of effect that may be missing.
+
+    Raises:
+        UserError: A file cannot be read, does not fit the model, or cannot be copied.
+    """
+    loaded = load_model(model, catalogue)
+    recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
+    copied = copy_model(loaded, run.path("model"))
+    with Console(stderr=True).status("reading the recordings") as status:
+        done = improve(loaded, recordings, held_out, status.update)
+        run.write_json("improve.json", finite_or_null(to_plain(done.to_json())))
+        save_card(run.path("model.toml"), dataclasses.replace(done.model, mjcf=copied))
+        status.update("writing the report")
+        sections = diagnosis_sections(done.diagnosis, loaded, recordings, held_out)
+    report.write(
+        run.path("report.html"),
+        kind="A model repaired from measurements",
+        title=f"Repair of {loaded.name}",
+        lead=diagnosis_lead(done.diagnosis),
+        facts=diagnosis_facts(done.diagnosis),
+        sections=[*sections, _card_section(done)],
+        reproduce=Reproduce.from_config(run.read_json("config.json")),
+    )
+    return done
+
+
+def _card_section(done: Improvement) -> Section:
+    last = done.rounds[-1]
+    what_is_left = {
+        "adequate": "A last diagnosis of the repaired model found it adequate.",
+        "unexplained": "A last diagnosis of the repaired model found a gap that no further effect "
+        "of the catalogue explains.",
+        "missing_effect": "The last diagnosis still found something; it was added, and the "
+        "repetition ended there.",
+    }[last.verdict]
+    text = (
+        f"`model.toml` beside this report {done.card}. It loads wherever a model is asked for: in "
+        "`garat compare` and `garat diagnose`, and in `garat export`, which writes plain MJCF. "
+        f"{what_is_left}"
+    )
+    return Section("The repaired model", text)

@@ -1,0 +1,93 @@
+"""`garat improve`: a hidden effect ends up in a model card that loads, and the error falls."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from garat_jax.diagnosis import load_model
+from garat_jax.diagnosis.hidden import make_recordings
+from garat_jax.diagnosis.improve import run_improve
+from garat_jax.effects import CATALOGUE
+from garat_jax.runs import RunDirectory
+from tests import models
+
+FEW = {kind: CATALOGUE[kind] for kind in ("viscous_damping", "coulomb_friction", "torque_offset")}
+
+
+@pytest.fixture(scope="module")
+def improved(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("improved")
+    path = folder / "pendulum.xml"
+    path.write_text(models.PENDULUM)
+    made = make_recordings(
+        path, folder / "data", 5, num_recordings=3, seconds=3.0, rate=125.0,
+        kind="coulomb_friction",
+    )  # fmt: skip
+    run = RunDirectory.create(folder / "run", {}, "garat improve pendulum.xml", [])
+    done = run_improve(path, (*made.fit, *made.holdout), (), run, catalogue=FEW)
+    return made, run, done
+
+
+def test_the_repaired_card_loads_and_has_the_effect(improved):
+    made, run, _ = improved
+    model = load_model(run.root / "model.toml")
+    (effect,) = model.effects
+    assert (effect.kind, effect.target) == ("coulomb_friction", "joint/hinge")
+    assert effect.torque == pytest.approx(made.parameters["torque"], rel=0.05)
+    assert model.mjcf.resolve().is_relative_to(run.root.resolve())
+    assert model.mjcf.read_text() == models.PENDULUM
+
+
+def test_the_ladder_falls_to_the_floor(improved):
+    _, run, done = improved
+    content = json.loads((run.root / "improve.json").read_text())
+    assert content["format"] == "garat-improve/1"
+    first, last = content["ladder"]
+    assert first["added"] is None
+    assert last["added"]["effect"] == "coulomb_friction"
+    assert last["error_holdout"] < 0.3 * first["error_holdout"]
+    assert content["error"]["after"] == last["error_holdout"]
+    assert content["error"]["after"] < 1.25 * content["error"]["noise_floor"]
+    assert content["verdict"] == "missing_effect"
+    assert [r["verdict"] for r in content["rounds"]] == ["missing_effect", "adequate"]
+    assert "+ coulomb_friction at joint/hinge: held-out error" in str(done)
+
+
+def test_each_recording_alone_shows_the_same_size(improved):
+    made, _, done = improved
+    (repeated,) = done.diagnosis.repeatability
+    assert (repeated.parameter, repeated.unit, repeated.agree) == ("torque", "N m", True)
+    assert [s.recording for s in repeated.recordings] == [
+        path.name for path in (*made.fit, *made.holdout)
+    ]
+    for seen in repeated.recordings:
+        assert seen.low < seen.estimate < seen.high
+        assert seen.estimate == pytest.approx(made.parameters["torque"], rel=0.15)
+
+
+def test_the_report_says_what_was_done(improved):
+    page = Path(improved[1].root / "report.html").read_text()
+    for part in ("Repair of pendulum", "The same in every recording?", "The repaired model"):
+        assert part in page
+    assert "A last diagnosis of the repaired model found it adequate." in page
+
+
+def test_recordings_of_different_sizes_disagree(tmp_path, improved):
+    from garat_jax.diagnosis.measurements import Recording
+    from garat_jax.diagnosis.repeat import repeatability
+
+    _, _, done = improved
+    model = load_model(done.diagnosis.model, FEW)
+    files = []
+    for seed in (5, 6):  # other seeds draw other sizes
+        made = make_recordings(
+            model.path, tmp_path / str(seed), seed, num_recordings=2, seconds=3.0, rate=125.0,
+            kind="coulomb_friction",
+        )  # fmt: skip
+        files.append((made.fit[0], made.parameters["torque"]))
+    recordings = [Recording.read(path, model) for path, _ in files]
+    (repeated,) = repeatability(model, recordings, (), done.diagnosis.selected)
+    assert not repeated.agree
+    for seen, (_, size) in zip(repeated.recordings, files, strict=True):
+        assert seen.estimate == pytest.approx(size, rel=0.15)

@@ -1,0 +1,70 @@
+"""`garat plan`: within the limits, and better at telling effects apart than a plain sine."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from garat_jax import cli
+from garat_jax.diagnosis import load_model
+from garat_jax.diagnosis.plan import Place, plan
+from tests import models
+
+
+@pytest.fixture
+def pendulum(tmp_path):
+    path = tmp_path / "pendulum.xml"
+    path.write_text(models.PENDULUM)
+    return path
+
+
+def test_a_plan_separates_dry_from_viscous_friction(pendulum, capsys):
+    out = pendulum.parent / "plan.csv"
+    arguments = ["viscous_damping", "coulomb_friction@joint/hinge", "--seconds", "4"]
+    status = cli.main(["plan", str(pendulum), "--separate", *arguments, "--out", str(out)])
+    assert status == 0
+    printed = capsys.readouterr().out
+    before, after = (float(printed.split(word)[1].split()[0]) for word in ("cosine", "sine, "))
+    assert after < before - 0.05
+    frame = pd.read_csv(out)
+    assert list(frame.columns) == ["time", "ctrl.motor"]
+    assert frame.time.iloc[-1] == pytest.approx(3.99)
+    assert frame["ctrl.motor"].abs().max() <= 3.0
+    assert frame["ctrl.motor"].std() > 0.01
+
+
+def test_the_same_seed_plans_the_same(pendulum):
+    model = load_model(pendulum)
+    places = Place("viscous_damping", "joint/hinge"), Place("rotor_inertia", "joint/hinge")
+    first, second = (plan(model, *places, seconds=2.0, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(first.ctrl, second.ctrl)
+    assert first.after <= first.before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--separate", "viscos_damping", "coulomb_friction"], "did you mean viscous_damping"),
+        (["--separate", "viscous_damping@joint/hing", "motor_gain"], "did you mean joint/hinge"),
+        (["--separate", "viscous_damping", "viscous_damping"], "are the same; name two effects"),
+        (["--separate", "actuator_delay", "motor_gain"], "write actuator_delay@TARGET"),
+        (["--separate", "viscous_damping", "motor_gain", "--seconds", "0"], "expected 2 to 600"),
+        (["--separate", "viscous_damping"], "--separate"),
+    ],
+)
+def test_refusals(pendulum, capsys, arguments, said):
+    out = pendulum.parent / "plan.csv"
+    assert cli.main(["plan", str(pendulum), *arguments, "--out", str(out)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert not out.exists()
+
+
+def test_a_model_without_actuators_is_refused(tmp_path, capsys):
+    spec = models.spec(models.PENDULUM)
+    spec.delete(spec.actuators[0])
+    spec.compile()
+    path = tmp_path / "free.xml"
+    path.write_text(spec.to_xml())
+    separate = ["--separate", "viscous_damping", "coulomb_friction"]
+    assert cli.main(["plan", str(path), *separate, "--out", str(tmp_path / "x.csv")]) == 2
+    assert "has no actuators, so nothing can be commanded" in capsys.readouterr().err
