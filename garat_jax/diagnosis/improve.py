@@ -219,8 +219,8 @@ def _card_section(done: Improvement) -> Section:
         "repetition ended there.",
     }[last.verdict]
     text = (
-        f"`model.toml` beside this report {done.card}. It loads wherever a model is asked for: in "
-        "`garat compare` and `garat diagnose`, and in `garat export`, which writes plain MJCF. "
+        f"model.toml beside this report {done.card}. It loads wherever a model is asked for: in "
+        "garat compare and garat diagnose, and in garat export, which writes plain MJCF. "
         f"{what_is_left}"
     )
     return Section("The repaired model", text)
