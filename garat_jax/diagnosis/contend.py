@@ -4,12 +4,10 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 from garat_jax.diagnosis.fit import Fit, Problem, fit
-from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
+from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, simpler_law
 
 CONTENDERS = 4
 """How many candidates are fitted each round, besides those that are like the first."""
-WORTH_REFINING = 0.8
-"""Share of what a simpler law leaves unexplained that a refinement of it must get below."""
 CONTENDER_STEPS = 6
 """Gauss-Newton steps of a contender, which starts where screening expects it."""
 
@@ -40,7 +38,7 @@ def fit_contenders(
     """
     likely = [s for s in scores if not s.excluded and s.possible and s.share > 0.02]
     likely = [s for s in likely if s.share > 0.25 * likely[0].share]
-    likely = [s for s in likely if not _is_idle_refinement(problem, s, likely)]
+    likely = [s for s in likely if not simpler_law(problem, s, likely)]
     if not likely:
         return []
     chosen = likely[:CONTENDERS]
@@ -51,17 +49,6 @@ def fit_contenders(
         say(f"fitting {effect.kind} at {effect.target}")
         contenders.append(Contender(score, _fit_with(problem, current, score)))
     return contenders
-
-
-def _is_idle_refinement(problem: Problem, score: Score, scores: Sequence[Score]) -> bool:
-    """Say whether a simpler law at the same place leaves hardly more unexplained."""
-    effect = problem.simulator.effects[score.effect]
-    for other in scores:
-        simpler = problem.simulator.effects[other.effect]
-        is_simpler = simpler.target == effect.target and simpler.kind in effect.refines
-        if is_simpler and 1 - score.share > WORTH_REFINING * (1 - other.share):
-            return True
-    return False
 
 
 def _fit_with(problem: Problem, current: Fit, score: Score) -> Fit:

@@ -27,6 +27,8 @@ from garat_jax.diagnosis.simulate import Simulator
 
 EQUIVALENT = 0.95
 """Cosine of two candidates' contributions above which the recordings cannot tell them apart."""
+WORTH_REFINING = 0.8
+"""Share of what a simpler law leaves unexplained that a refinement of it must get below."""
 SCREENED = 24
 """Segments that are screened at least, evenly chosen; scores take many simulations each."""
 VISIBLE = 3.0
@@ -149,7 +151,26 @@ def screen(problem: Problem, fit: Fit, skip: Sequence[int] = ()) -> list[Score]:
         largest = max(largest, min(1.0, judged[index].p_value * (len(judged) - rank)))
         adjusted[judged[index].effect] = largest
     scores = [dataclasses.replace(s, p_value=adjusted.get(s.effect, 1.0)) for s in raw.values()]
-    return sorted(scores, key=lambda s: (bool(s.excluded), not s.possible, -s.share))
+    simpler = [simpler_law(problem, s, scores) for s in scores]
+    place = [s.share if o is None else min(s.share, o.share - 1e-9) for s, o in zip(
+        scores, simpler, strict=True
+    )]  # fmt: skip
+    order = sorted(
+        range(len(scores)),
+        key=lambda i: (bool(scores[i].excluded), not scores[i].possible, -place[i]),
+    )
+    return [scores[i] for i in order]
+
+
+def simpler_law(problem: Problem, score: Score, scores: Sequence[Score]) -> Score | None:
+    """Return the score of a simpler law at the same place that leaves hardly more unexplained."""
+    effect = problem.simulator.effects[score.effect]
+    for other in scores:
+        simpler = problem.simulator.effects[other.effect]
+        is_simpler = simpler.target == effect.target and simpler.kind in effect.refines
+        if is_simpler and 1 - score.share > WORTH_REFINING * (1 - other.share):
+            return other
+    return None
 
 
 def cosine(a: Score, b: Score) -> float:
