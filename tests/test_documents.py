@@ -9,6 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from garat_jax.diagnosis.hidden import make_recordings
+from garat_jax.diagnosis.maps import read_map
+from tests import models
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 DOCUMENTS = [*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("*.md")]
 SNIPPETS = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
@@ -55,3 +59,24 @@ def test_the_page_on_your_own_robot_runs(tmp_path, monkeypatch, capsys):
     assert names["obs"].shape == (8, 4)
     assert np.isfinite(names["metrics"]["value_loss"])
     assert "(8, 4)" in capsys.readouterr().out
+
+
+def test_the_diagnosis_pages_python_runs(tmp_path, monkeypatch, capsys):
+    page = (REPOSITORY / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    model = tmp_path / "pendulum.xml"
+    model.write_text(models.PENDULUM)
+    made = make_recordings(
+        model, tmp_path / "data", 5, num_recordings=3, seconds=3.0, rate=125.0,
+        kind="coulomb_friction",
+    )  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    exec(snippet, {"paths": (*made.fit, *made.holdout)})
+    assert "Missing: coulomb_friction at joint/hinge" in capsys.readouterr().out
+
+
+def test_the_diagnosis_pages_map_is_read(tmp_path):
+    page = (REPOSITORY / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "map.toml").write_text(text)
+    assert read_map(tmp_path / "map.toml").columns["qpos.elbow"].unit == "deg"

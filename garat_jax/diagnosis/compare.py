@@ -1,6 +1,7 @@
 """Compare a model as it is with measurements: how large its error is, and where."""
 
 import dataclasses
+import html
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -8,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import plotly.graph_objects as go
 
+from garat_jax.diagnosis import figures
 from garat_jax.diagnosis.diagnose import choose_horizon, thin
 from garat_jax.diagnosis.fit import Problem, settle
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
@@ -89,6 +92,17 @@ class Comparison:
             )
         lines += [f"  torque at {torque.sentence}" for torque in self.torques]
         return "\n".join(lines)
+
+    def plot(self) -> go.Figure:
+        """Draw the error against the horizon, and the noise floor."""
+        drawn = [(h.seconds, h.error) for h in self.horizons]
+        return figures.errors_against_horizon(
+            [("model as it is", figures.BEFORE, drawn)], self.error.noise_floor
+        )
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return f"<pre>{html.escape(str(self))}</pre>"
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of compare.json; what is not finite is null."""

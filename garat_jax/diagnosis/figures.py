@@ -39,19 +39,35 @@ def was_fitted(candidate: Candidate) -> bool:
 
 
 def errors_by_horizon(before: Sequence[Replay], after: Sequence[Replay], floor: float) -> go.Figure:
-    """Draw the error against the horizon, and the noise floor."""
+    """Draw the error against the horizon, before and after the repair, and the noise floor."""
+    lines = [
+        (name, colour, [(p.horizon, p.error()) for p in played])
+        for played, name, colour in ((before, "model as it is", BEFORE), (after, "repaired", AFTER))
+        if played
+    ]
+    return errors_against_horizon(lines, floor)
+
+
+def errors_against_horizon(
+    lines: Sequence[tuple[str, str, Sequence[tuple[float, float]]]], floor: float
+) -> go.Figure:
+    """Draw errors against the horizon, and the noise floor.
+
+    Args:
+        lines: Name, colour, and (seconds, error) of each line.
+        floor: The noise floor.
+    """
     figure = go.Figure()
-    for played, name, colour in ((before, "model as it is", BEFORE), (after, "repaired", AFTER)):
-        if played:
-            figure.add_scatter(
-                x=[p.horizon for p in played],
-                y=[100 * p.error() for p in played],
-                name=name,
-                mode="lines+markers",
-                line={"color": colour, "width": 2.5},
-                marker={"size": 8},
-                hovertemplate="%{x} s: %{y:.3g} %",
-            )
+    for name, colour, points in lines:
+        figure.add_scatter(
+            x=[seconds for seconds, _ in points],
+            y=[100 * error for _, error in points],
+            name=name,
+            mode="lines+markers",
+            line={"color": colour, "width": 2.5},
+            marker={"size": 8},
+            hovertemplate="%{x} s: %{y:.3g} %",
+        )
     figure = styled(figure, height=300)
     _floor(figure, floor)
     figure.update_xaxes(title_text="horizon of the prediction [s]", rangemode="tozero")

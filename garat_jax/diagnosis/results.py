@@ -1,10 +1,14 @@
 """What a diagnosis says: typed, printable, and the content of diagnosis.json."""
 
 import dataclasses
-from collections.abc import Mapping
+import html
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
+import plotly.graph_objects as go
+
 from garat_jax.diagnosis.localise import Place
+from garat_jax.errors import choose
 from garat_jax.runs import finite_or_null, to_plain
 
 FORMAT = "garat-diagnosis/1"
@@ -168,6 +172,25 @@ class Diagnosis:
     def to_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json; what is not finite is null."""
         return {"format": FORMAT, **finite_or_null(to_plain(self))}
+
+    def plot(self, what: str = "ladder") -> go.Figure:
+        """Draw the `ladder` of errors, the `ranking` of effects, or `where` the model fails.
+
+        Raises:
+            UserError: There is no such drawing.
+        """
+        from garat_jax.diagnosis import figures
+
+        drawings: dict[str, Callable[[], go.Figure]] = {
+            "ladder": lambda: figures.ladder(self),
+            "ranking": lambda: figures.ranking(self.candidates),
+            "where": lambda: figures.where_it_fails(self.where),
+        }
+        return choose("drawing", what, drawings)()
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return f"<pre>{html.escape(str(self))}</pre>"
 
     @property
     def sentence(self) -> str:

@@ -1,0 +1,56 @@
+"""The example gallery runs as it stands and finds what its texts say."""
+
+import runpy
+from pathlib import Path
+
+import plotly.graph_objects as go
+import pytest
+
+from garat_jax.diagnosis.results import Diagnosis
+from garat_jax.errors import UserError
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def run(name):
+    return runpy.run_path(str(EXAMPLES / name))
+
+
+def test_compare(capsys):
+    names = run("01_compare.py")
+    assert "times what noise alone would make" in capsys.readouterr().out
+    assert isinstance(names["figure"], go.Figure)
+    assert "pendulum" in names["comparison"].model
+    assert names["comparison"]._repr_html_().startswith("<pre>The model&#x27;s error is")
+
+
+def test_find_missing_friction(capsys):
+    found: Diagnosis = run("02_find_missing_friction.py")["diagnosis"]
+    assert [c.effect for c in found.selected] == ["coulomb_friction"]
+    assert "Missing: coulomb_friction" in capsys.readouterr().out
+    assert all(len(found.plot(what).data) for what in ("ladder", "ranking", "where"))
+    assert "<pre>Missing: coulomb_friction" in found._repr_html_()
+    with pytest.raises(UserError, match="did you mean ranking"):
+        found.plot("rankin")
+
+
+def test_export(capsys):
+    names = run("03_export.py")
+    assert names["repaired"].dof_frictionloss[0] == pytest.approx(0.06)
+    assert "not in MJCF: " in capsys.readouterr().out
+
+
+def test_user_effect():
+    sized = run("04_user_effect.py")["sized"]
+    assert float(sized.effect.fade) == pytest.approx(0.5, rel=0.1)
+    assert sized.error_after < 0.5 * sized.error_before
+
+
+def test_an_own_effect_takes_under_30_lines():
+    text = (EXAMPLES / "my_effects.py").read_text(encoding="utf-8")
+    assert sum(bool(line.strip()) for line in text.splitlines()) < 30
+
+
+def test_every_example_is_run_here():
+    here = Path(__file__).read_text(encoding="utf-8")
+    assert all(f'"{path.name}"' in here for path in EXAMPLES.glob("*.py"))
