@@ -236,12 +236,13 @@ def trajectory(
     model = view(dynamics)
     constants = _constants(dynamics, model)
     num_steps, host, nq = ctrl.shape[0] - warm_up, dynamics.host, dynamics.host.model.nq
+    held = 1 if not jax.tree.leaves(state.memory) else num_substeps  # without memory all are alike
 
     def control_step(memory, inputs):
         command, seen = inputs
         if seen is not None:
             seen = state._replace(qpos=seen[:nq], qvel=seen[nq:])
-        *results, memory = _commands(dynamics, model, seen, memory, command, num_substeps)
+        *results, memory = _commands(dynamics, model, seen, memory, command, held)
         return memory, tuple(results)
 
     _, (commands, forces) = jax.lax.scan(control_step, state.memory, (ctrl, along))

@@ -26,6 +26,8 @@ FITTED = 1e-4
 """Fall of the cost, relative to it, below which a fit has converged."""
 SETTLED = 1e-3
 """Fall of a segment's cost, relative to it, below which its initial state is left as it is."""
+SETTLE_STEPS = 4
+"""Steps of the initial states after a fit, whose own steps have moved them already."""
 LARGE = 1e8
 """Whitened residual that stands for a simulation that diverged."""
 
@@ -268,7 +270,7 @@ def fit(problem: Problem, theta, start, free, iterations: int = 12) -> Fit:
         else:
             damping = max(damping, 1e-3) * 30.0
     low, high = _interval(problem, theta, start, lin, free, keep)
-    settled = settle(problem, theta, start)
+    settled = settle(problem, theta, start, SETTLE_STEPS)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
     return Fit(theta, free, frozen, settled.start, settled.residual, low, high)
 

@@ -77,7 +77,7 @@ class Simulator:
         self._owner = np.asarray([slot.effect for slot in self.slots], int)
         looking = [i for i, e in enumerate(candidates) if e.reads_state or e.notes]
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
-        self._along = tuple(i for i in looking if self._is_memoryless(candidates[i]))
+        self._memoryless = tuple(i for i in looking if self._is_memoryless(candidates[i]))
         own = self._world.replace(effects=self._own)
         self._any_at_once = dynamics.steps_at_once(own)
         self._programs: dict[tuple[str, tuple[int, ...]], Callable] = {}
@@ -105,7 +105,7 @@ class Simulator:
         at_once = np.asarray([self._is_at_once(row) for row in theta], bool)
         for rows in (np.flatnonzero(at_once), np.flatnonzero(~at_once)):
             if len(rows):
-                run = self._program(theta[rows])
+                run = self._program(self._acting(theta[rows], self.base))
                 result[rows] = self._in_batches(run, segments, theta[rows], start[rows])[0]
         return result
 
@@ -127,48 +127,61 @@ class Simulator:
             Changes of the predictions, [P, S, L, num_signals].
         """
         result = np.empty((len(theta), *segments.measured.shape))
-        now, path = self._in_batches(self._program(base[None]), segments, base[None], start[None])
-        for way, rows in self._ways(theta, base).items():
-            starts = np.broadcast_to(start, (len(rows) + 1, *start.shape))
-            if way != "along":
-                result[rows] = self.predict(theta[rows], starts[1:], segments) - now
-                continue
-            run = self._jitted(("along", ()), self._predict_along)
-            both = np.concatenate([base[None], theta[rows]])
-            changed, _ = self._in_batches(run, segments, both, starts, path[0])
-            result[rows] = changed[1:] - changed[0]
+        acting = self._acting(base[None], self.base)
+        now, path = self._in_batches(self._program(acting), segments, base[None], start[None])
+        for (way, _), rows in self._ways(theta, base).items():
+            moved, starts = theta[rows], np.broadcast_to(start, (len(rows) + 1, *start.shape))
+            if way == "stepped":
+                result[rows] = self.predict(moved, starts[1:], segments) - now
+            elif way == "at once":
+                run = self._program(self._blind)
+                result[rows] = self._in_batches(run, segments, moved, starts[1:])[0] - now
+            else:
+                both = np.concatenate([base[None], moved])
+                run = self._along(self._acting(both, self.base))
+                changed = self._in_batches(run, segments, both, starts, path[0])[0]
+                result[rows] = changed[1:] - changed[0]
         return result
 
-    def _ways(self, theta: np.ndarray, base: np.ndarray) -> dict[str, list[int]]:
-        """Sort rows by how their change is had: "at once", "along", or a kind that is stepped."""
-        ways: dict[str, list[int]] = {}
+    def _ways(self, theta: np.ndarray, base: np.ndarray) -> dict[tuple[str, str], list[int]]:
+        """Sort rows by how their change is had, and by what moves unless that is at once."""
+        ways: dict[tuple[str, str], list[int]] = {}
+        blind, memoryless = {*self._blind}, {*self._blind, *self._memoryless}
         for i, row in enumerate(theta):
-            moved = set(self._owner[row != base].tolist())
-            if self._any_at_once and moved <= {*self._blind}:
-                way = "at once"
-            elif self._any_at_once and moved <= {*self._blind, *self._along}:
-                way = "along"
+            moved = self._acting(row[None], base)
+            kinds = " ".join(sorted({self.effects[j].kind for j in moved}))
+            acting = {*self._acting(row[None], self.base)}
+            if self._any_at_once and acting <= blind:
+                way = ("at once", "")
+            elif self._any_at_once and {*moved} <= memoryless and acting <= memoryless:
+                way = ("along", kinds)
             else:
-                way = " ".join(sorted({self.effects[j].kind for j in moved}))
+                way = ("stepped", kinds)
             ways.setdefault(way, []).append(i)
         return ways
 
+    def _acting(self, thetas: np.ndarray, base: np.ndarray) -> tuple[int, ...]:
+        """Return the effects that some row of parameters [P, num_parameters] moves off a base."""
+        return tuple(int(i) for i in np.unique(self._owner[np.any(thetas != base, axis=0)]))
+
     def _is_at_once(self, theta: np.ndarray) -> bool:
-        acting = set(self._owner[theta != self.base].tolist())
-        return self._any_at_once and acting <= {*self._blind}
+        return self._any_at_once and {*self._acting(theta[None], self.base)} <= {*self._blind}
 
-    def _program(self, thetas: np.ndarray) -> Callable:
-        """Return the compiled program for parameters [P, num_parameters] that go together."""
-        if all(self._is_at_once(theta) for theta in thetas):
-            return self._jitted(("at once", ()), self._predict_at_once)
-        acting = self._owner[np.any(thetas != self.base, axis=0)]
-        chosen = tuple(int(i) for i in np.unique(acting))
-        return self._jitted(("stepped", chosen), functools.partial(self._predict, chosen))
+    def _program(self, chosen: tuple[int, ...]) -> Callable:
+        """Return the compiled program in which these candidates act."""
+        if self._any_at_once and {*chosen} <= {*self._blind}:
+            return self._jitted("at once", chosen, self._predict_at_once)
+        return self._jitted("stepped", chosen, self._predict)
 
-    def _jitted(self, key, function) -> Callable:
-        if key not in self._programs:
-            self._programs[key] = jax.jit(jax.vmap(function))
-        return self._programs[key]
+    def _along(self, chosen: tuple[int, ...]) -> Callable:
+        """Return the compiled program in which these candidates look at a given path."""
+        return self._jitted("along", chosen, self._predict_along)
+
+    def _jitted(self, way: str, chosen: tuple[int, ...], function) -> Callable:
+        if (way, chosen) not in self._programs:
+            one = functools.partial(function, chosen)
+            self._programs[way, chosen] = jax.jit(jax.vmap(one))
+        return self._programs[way, chosen]
 
     def _in_batches(self, run, segments: Segments, theta, start, path=None):
         """Run a program for rows [P] and segments [S]; return signals and paths [P, S, ..].
@@ -210,14 +223,14 @@ class Simulator:
         num_position = self.host.nq
         return dynamics.initial_state(world, start[:num_position], start[num_position:])
 
-    def _predict_at_once(self, theta, start, ctrl, place):
-        """Predict one segment with the candidates that do not look at the state."""
-        world = self._world_with(theta, self._blind)
+    def _predict_at_once(self, chosen: tuple[int, ...], theta, start, ctrl, place):
+        """Predict one segment with candidates that do not look at the state."""
+        world = self._world_with(theta, chosen)
         return self._trace(world, start, ctrl, place, None)
 
-    def _predict_along(self, theta, start, ctrl, place, path):
+    def _predict_along(self, chosen: tuple[int, ...], theta, start, ctrl, place, path):
         """Predict one segment with candidates that look at a path [T + 1, nq + nv] instead."""
-        world = self._world_with(theta, (*self._blind, *self._along))
+        world = self._world_with(theta, chosen)
         between = (path[:-1] + path[1:]) / 2
         before = jnp.broadcast_to(path[0], (self._warm_up, *path.shape[1:]))
         return self._trace(world, start, ctrl, place, jnp.concatenate([before, between]))

@@ -154,24 +154,33 @@ class ActuatorDelay(Effect):
         source="Tan et al. 2018 (arXiv 1804.10332): latencies of 0 to 40 ms, with room to spare",
     )
 
+    def _actuators(self, host: mujoco.MjModel) -> np.ndarray:
+        """Return the indices of the actuators that are late."""
+        if self.target == "all":
+            return np.arange(host.nu)
+        return np.asarray([element_id(host, "actuator", self.name)])
+
     def init(self, host: mujoco.MjModel):
-        """Return past commands [substeps that the longest delay spans, nu] and whether any came."""
+        """Return a ring of past commands and how many came.
+
+        The ring is [substeps that the longest delay spans, late actuators]; the command of substep
+        k is in row k modulo its length.
+        """
         substeps = int(np.ceil(self.parameters()[0].high / host.opt.timestep)) + 2
-        return jnp.zeros((substeps, host.nu)), jnp.zeros((), bool)
+        return jnp.zeros((substeps, len(self._actuators(host)))), jnp.zeros((), jnp.int32)
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
-        """Push the command and read the one from `delay` seconds ago."""
-        past, started = memory
-        past = jnp.where(started, jnp.roll(past, 1, axis=0).at[0].set(ctrl), ctrl)
-        substeps = jnp.clip(self.delay / model.host.opt.timestep, 0, past.shape[0] - 1)
-        whole = jnp.floor(substeps).astype(int)
-        later = jnp.minimum(whole + 1, past.shape[0] - 1)
+        """Put the command into the ring and read the one from `delay` seconds ago."""
+        past, count = memory
+        late = self._actuators(model.host)
+        length = past.shape[0]
+        past = past.at[count % length].set(ctrl[late].astype(past.dtype))
+        substeps = jnp.clip(self.delay / model.host.opt.timestep, 0, length - 2)
+        whole = jnp.floor(substeps).astype(jnp.int32)
         fraction = (substeps - whole).astype(ctrl.dtype)
-        delayed = (1 - fraction) * past[whole] + fraction * past[later]
-        if self.target != "all":
-            index = element_id(model.host, "actuator", self.name)
-            delayed = ctrl.at[index].set(delayed[index])
-        return delayed.astype(ctrl.dtype), None, (past, jnp.ones((), bool))
+        ago, before = (jnp.maximum(count - whole - i, 0) % length for i in (0, 1))
+        delayed = (1 - fraction) * past[ago] + fraction * past[before]
+        return ctrl.at[late].set(delayed.astype(ctrl.dtype)), None, (past, count + 1)
 
     def export(self, spec: mujoco.MjSpec) -> str:
         """Give the actuators MuJoCo's own delay, with a buffer that is long enough."""
