@@ -1,5 +1,7 @@
 """The two engines are one physics, and overrides and effects reach both."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -51,6 +53,14 @@ SIZES = {
 }
 
 
+CORE = (
+    "viscous_damping", "coulomb_friction", "torque_offset", "motor_gain", "actuator_delay",
+    "payload_mass", "gravity_scale", "air_drag", "encoder_offset",
+)  # fmt: skip
+"""Kinds of every sort; MJX compiles each for several seconds, the others when slow tests run."""
+WITH_MJX = [pytest.param(k, marks=() if k in CORE else pytest.mark.slow) for k in CATALOGUE]
+
+
 @pytest.fixture(autouse=True)
 def _float64():
     with jax.enable_x64(True):
@@ -63,8 +73,8 @@ def make(kind: str, nominal: bool = False):
     return cls(target=target, **(cls.at(host, target) if nominal else SIZES[kind]))
 
 
-def simulate(world: dynamics.Dynamics, num_steps: int = 40, num_substeps: int = 3) -> np.ndarray:
-    """Return the sensed qpos and qvel [num_steps, nq + nv] under a fixed command."""
+@functools.partial(jax.jit, static_argnums=(1, 2))  # compiled once for all sizes of an effect
+def _simulate(world: dynamics.Dynamics, num_steps: int, num_substeps: int):
     host = world.host.model
     state = dynamics.initial_state(
         world, jnp.asarray(host.qpos0) + 0.3, jnp.linspace(-0.5, 0.5, host.nv)
@@ -76,31 +86,42 @@ def simulate(world: dynamics.Dynamics, num_steps: int = 40, num_substeps: int = 
         reported = dynamics.sensed(world, state)
         return state, jnp.concatenate([reported.qpos, reported.qvel])
 
-    return np.asarray(
-        jax.jit(lambda s: jax.lax.scan(control_step, s, jnp.arange(num_steps)))(state)[1]
-    )
+    return jax.lax.scan(control_step, state, jnp.arange(num_steps))[1]
+
+
+def simulate(world: dynamics.Dynamics, num_steps: int = 40, num_substeps: int = 3) -> np.ndarray:
+    """Return the sensed qpos and qvel [num_steps, nq + nv] under a fixed command."""
+    return np.asarray(_simulate(world, num_steps, num_substeps))
 
 
 def compiled(mjcf: str, *effects, engine: str, overrides=()):
     return dynamics.compile(spec(mjcf), overrides, effects, engine)
 
 
-@pytest.mark.parametrize("kind", CATALOGUE)
+@pytest.mark.parametrize("kind", WITH_MJX)
 def test_both_engines_agree_with_every_effect(kind):
     effect = make(kind)
     mjx, c = (simulate(compiled(showing(kind), effect, engine=e)) for e in ("mjx", "mujoco"))
     np.testing.assert_allclose(mjx, c, rtol=1e-4, atol=2e-5)
 
 
-@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
-@pytest.mark.parametrize("kind", CATALOGUE)
-def test_an_effect_at_its_nominal_is_the_identity_and_elsewhere_is_not(kind, engine):
+def assert_identity_at_nominal_alone(kind: str, engine: str):
     mjcf = showing(kind)
-    plain = simulate(compiled(mjcf, engine=engine), 10)
-    nominal = simulate(compiled(mjcf, make(kind, nominal=True), engine=engine), 10)
-    present = simulate(compiled(mjcf, make(kind), engine=engine), 10)
+    plain = simulate(compiled(mjcf, engine=engine))[:10]
+    nominal = simulate(compiled(mjcf, make(kind, nominal=True), engine=engine))[:10]
+    present = simulate(compiled(mjcf, make(kind), engine=engine))[:10]
     np.testing.assert_allclose(nominal, plain, atol=1e-6)
     assert np.abs(present - plain).max() > 1e-3
+
+
+@pytest.mark.parametrize("kind", CATALOGUE)
+def test_an_effect_at_its_nominal_is_the_identity_and_elsewhere_is_not(kind):
+    assert_identity_at_nominal_alone(kind, "mujoco")
+
+
+@pytest.mark.parametrize("kind", WITH_MJX)
+def test_in_mjx_too_an_effect_at_its_nominal_is_the_identity(kind):
+    assert_identity_at_nominal_alone(kind, "mjx")
 
 
 def test_a_loop_in_plain_mujoco_gives_the_same_trajectory():
