@@ -40,7 +40,11 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
     spec = model.spec.copy()
     for override in model.overrides:
         override.apply(spec)
-    unsaid = tuple(filter(None, (effect.export(spec) for effect in model.effects)))
+    unsaid = tuple(
+        line if effect.kind in line else f"{effect.kind} at {effect.target}: {line}"
+        for effect in model.effects
+        if (line := effect.export(spec))
+    )
     _point_at_assets(spec, model.mjcf.parent, path.parent)
     try:
         spec.compile()

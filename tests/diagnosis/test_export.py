@@ -80,6 +80,7 @@ def test_overrides_are_in_the_exported_file(tmp_path, capsys):
     np.testing.assert_allclose(simulate_plain(out), simulate_card(load_model(card)), atol=2e-4)
 
 
+@pytest.mark.slow  # a program a kind; tests/effects has the kinds one by one
 @pytest.mark.parametrize("kind", CATALOGUE)
 def test_what_mjcf_can_say_is_the_same_physics(tmp_path, kind):
     model = load_model(write(tmp_path))
