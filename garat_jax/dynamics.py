@@ -246,7 +246,9 @@ def trajectory(
         return memory, tuple(results)
 
     _, (commands, forces) = jax.lax.scan(control_step, state.memory, (ctrl, along))
-    commands, forces = (x[warm_up:].reshape(-1, x.shape[-1]) for x in (commands, forces))
+    commands, forces = (
+        x[warm_up:].reshape(num_steps * x.shape[1], x.shape[2]) for x in (commands, forces)
+    )
     path = host.trace(constants, state, commands, forces, num_steps, num_substeps)
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_steps, *x.shape)), state)
     return states._replace(qpos=path[:, :nq], qvel=path[:, nq:])

@@ -276,3 +276,24 @@ def test_the_native_model_is_what_the_engine_steps():
     state = dynamics.step(world, state, jnp.zeros(model.nu), 5)
     np.testing.assert_allclose(state.qpos, data.qpos, rtol=1e-9)
     assert dynamics.view(world).host.body("forearm_payload").mass[0] < 1e-8
+
+
+@pytest.mark.parametrize("driven", [True, False])
+def test_many_steps_at_once_are_the_same_as_one_by_one(driven):
+    model = spec(PENDULUM)
+    if not driven:
+        model.delete(model.actuator("motor"))
+    kinds = (ViscousDamping("joint/hinge", 0.1), *([ActuatorDelay("all", 0.007)] * driven))
+    world = dynamics.compile(model, effects=kinds, engine="mujoco")
+    assert dynamics.steps_at_once(world)
+    ctrl = jnp.sin(jnp.arange(12.0))[:, None] * jnp.ones(world.host.model.nu)
+    start = dynamics.initial_state(world, jnp.asarray([0.4]), jnp.asarray([0.0]))
+
+    def step(state, command):
+        state = dynamics.step(world, state, command, 3)
+        return state, jnp.concatenate([state.qpos, state.qvel])
+
+    one_by_one = jax.jit(lambda: jax.lax.scan(step, start, ctrl)[1])()
+    at_once = jax.jit(lambda: dynamics.trajectory(world, start, ctrl, 3))()
+    path = np.concatenate([at_once.qpos, at_once.qvel], axis=1)
+    np.testing.assert_allclose(path, one_by_one, atol=1e-12)
