@@ -86,8 +86,8 @@ def test_what_mjcf_can_say_is_the_same_physics(tmp_path, kind):
     model = load_model(write(tmp_path))
     host = model.compile("mujoco").host.model
     cls = CATALOGUE[kind]
-    target = cls.targets(host)[0]
-    effect = cls(target=target, **cls.starts(host, target)[0])
+    target = cls.targets(host)[-1]
+    effect = cls(target=target, **cls.starts(host, target)[-1])
     card = load_model(save_card(tmp_path / "with.toml", model, [effect]))
     exported = export_mjcf(card, tmp_path / "with.xml")
     if exported.unsaid:
