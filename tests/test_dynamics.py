@@ -297,3 +297,13 @@ def test_many_steps_at_once_are_the_same_as_one_by_one(driven):
     at_once = jax.jit(lambda: dynamics.trajectory(world, start, ctrl, 3))()
     path = np.concatenate([at_once.qpos, at_once.qvel], axis=1)
     np.testing.assert_allclose(path, one_by_one, atol=1e-12)
+
+
+def test_kinds_at_one_target_are_pytrees_of_their_own():
+    """jit looks programs up by structure: equal structures would run one law for another."""
+    structures = [
+        jax.tree.structure(effect(target="there", **{p.name: 0.0 for p in effect.parameters()}))
+        for effect in CATALOGUE.values()
+    ]
+    for i, structure in enumerate(structures):
+        assert all(structure != other for other in structures[:i])

@@ -147,6 +147,18 @@ class Effect(abc.ABC):
 
     target: str = struct.field(pytree_node=False)
 
+    def __init_subclass__(cls) -> None:
+        """Make the kind a static field, so that two kinds at one target differ as pytrees.
+
+        jaxlib 0.10 compares the structures of dataclasses without their types: whenever the hashes
+        of two laws fell into one bucket, jit ran the program of the one with the numbers of the
+        other.
+        """
+        super().__init_subclass__()
+        if "kind" in cls.__dict__:
+            cls.__annotations__["kind"] = str
+            cls.kind = struct.field(pytree_node=False, default=cls.kind, kw_only=True)
+
     @property
     def name(self) -> str:
         """The target without its kind: `elbow` of `joint/elbow`."""

@@ -91,6 +91,8 @@ def _check(cls: type[Effect], origin: str) -> None:
     if not inspect.isclass(cls) or not issubclass(cls, Effect):
         raise UserError(f"{origin}: {cls!r} is no subclass of garat_jax.effects.Effect")
     declared = vars(cls)
+    if "__dataclass_fields__" not in declared:
+        raise UserError(f"{origin}: {cls.__name__} needs the decorator flax.struct.dataclass")
     for name in ("kind", "law", "identified_by"):
         if not isinstance(declared.get(name), str) or not declared[name]:
             raise UserError(f'{origin}: {cls.__name__} lacks {name}; write {name} = "..."')
@@ -100,7 +102,5 @@ def _check(cls: type[Effect], origin: str) -> None:
             f"{origin}: {cls.__name__}.elements is {elements!r}; expected a tuple of "
             f"{', '.join(PLACES)}"
         )
-    if "__dataclass_fields__" not in declared:
-        raise UserError(f"{origin}: {cls.__name__} needs the decorator flax.struct.dataclass")
     if not cls.parameters():
         raise UserError(f"{origin}: {cls.__name__} has no parameter; declare one by parameter(...)")
