@@ -164,11 +164,6 @@ def sensed(dynamics: Dynamics, state: PhysicsState) -> PhysicsState:
     return state
 
 
-def sensor_lag(dynamics: Dynamics) -> jax.Array | float:
-    """Return the seconds by which all sensors are late."""
-    return sum((effect.sensor_lag() for effect in dynamics.effects), 0.0)
-
-
 def step(
     dynamics: Dynamics, state: PhysicsState, ctrl: jax.Array, num_substeps: int = 1
 ) -> PhysicsState:
@@ -236,16 +231,29 @@ def trajectory(
     model = view(dynamics)
     constants = _constants(dynamics, model)
     num_steps, host, nq = ctrl.shape[0] - warm_up, dynamics.host, dynamics.host.model.nq
-    held = 1 if not jax.tree.leaves(state.memory) else num_substeps  # without memory all are alike
+    remembering = [i for i, memory in enumerate(state.memory) if jax.tree.leaves(memory)]
+    count = max(remembering, default=-1) + 1
+    first = dynamics.replace(effects=dynamics.effects[:count])
+    then = dynamics.replace(effects=dynamics.effects[count:])
+
+    def look(seen):
+        return None if seen is None else state._replace(qpos=seen[:nq], qvel=seen[nq:])
 
     def control_step(memory, inputs):
         command, seen = inputs
-        if seen is not None:
-            seen = state._replace(qpos=seen[:nq], qvel=seen[nq:])
-        *results, memory = _commands(dynamics, model, seen, memory, command, held)
+        *results, memory = _commands(first, model, look(seen), memory, command, num_substeps)
         return memory, tuple(results)
 
-    _, (commands, forces) = jax.lax.scan(control_step, state.memory, (ctrl, along))
+    def without_memory(command, force, seen):
+        command, more, _ = _act(then, model, look(seen), command, state.memory[count:])
+        return command, force + more
+
+    if count:
+        _, (commands, forces) = jax.lax.scan(control_step, state.memory[:count], (ctrl, along))
+    else:
+        commands, forces = ctrl[:, None], jnp.zeros((len(ctrl), 1, host.model.nv), ctrl.dtype)
+    in_substeps = jax.vmap(without_memory, (0, 0, None))
+    commands, forces = jax.vmap(in_substeps)(commands, forces, along)
     commands, forces = (
         x[warm_up:].reshape(num_steps * x.shape[1], x.shape[2]) for x in (commands, forces)
     )

@@ -114,38 +114,45 @@ class HostModel:
         with self._lock:
             batch = self._batch(num, frozenset(fields))
             _write_fields(batch, fields, shapes, leading)
-            _write_state(batch, np.broadcast_to(row, leading + row.shape[-1:]), num)
+            rows = np.broadcast_to(row, leading + row.shape[-1:]).reshape(num, -1)
+            _write_state(batch, rows)
             controls = np.broadcast_to(control, leading + control.shape[-2:])
-            result = function(batch, controls.reshape(num, *control.shape[-2:]))
+            result = function(batch, controls.reshape(num, *control.shape[-2:]), _finite(rows))
             with np.errstate(over="ignore"):  # what exploded is infinite in 32 bits
                 result = result.astype(row.dtype)
         return result.reshape(*leading, -1).view(np.uint32)
 
-    def _advance_batch(self, num_substeps: int, batch: Batch, controls) -> np.ndarray:
-        """Step a batch under controls [num, substeps or 1, nu + nv]; return its rows."""
+    def _advance_batch(self, num_substeps: int, batch: Batch, controls, ids) -> np.ndarray:
+        """Step a batch under controls [num, substeps or 1, nu + nv]; return its rows.
+
+        Simulations not in `ids`, unless that is None for all, stay as they are.
+        """
         if controls.shape[1] == 1:
             nu = self.model.nu
             batch.bind("ctrl")[:] = controls[:, 0, :nu]
             batch.bind("qfrc_applied")[:] = controls[:, 0, nu:]
-            batch.step(nstep=num_substeps)
+            batch.step(ids, nstep=num_substeps)
         else:
-            batch.rollout(num_substeps, controls, int(INPUTS), record=())
+            chosen = controls if ids is None else controls[ids]
+            batch.rollout(num_substeps, chosen, int(INPUTS), record=(), ids=ids)
         num = len(controls)
         parts = [batch.bind(name).reshape(num, -1) for name in (*STATE_FIELDS, "sensordata")]
         return np.concatenate(parts, axis=1)
 
-    def _trace_batch(self, num_substeps: int, repeat: int, batch: Batch, controls) -> np.ndarray:
+    def _trace_batch(self, num_substeps: int, repeat: int, batch: Batch, controls, ids):
         """Step a batch under controls [num, .., nu + nv], each held for `repeat` substeps.
 
         MuJoCo stops a simulation that diverges and repeats its last state; here it is NaN.
         """
-        controls = np.repeat(controls, repeat, axis=1)
-        length = controls.shape[1]
-        end = batch.bind("time").reshape(-1) + (length - 0.5) * self.model.opt.timestep
-        found = batch.rollout(length, controls, int(INPUTS), record=("qpos", "qvel"))
-        path = np.concatenate([found["qpos"], found["qvel"]], axis=2)
-        path = path[:, num_substeps - 1 :: num_substeps]
-        path[batch.bind("time").reshape(-1) < end] = np.nan
+        num, length = len(controls), controls.shape[1] * repeat
+        chosen = np.repeat(controls if ids is None else controls[ids], repeat, axis=1)
+        time = batch.bind("time").reshape(-1)
+        end = time + (length - 0.5) * self.model.opt.timestep
+        found = batch.rollout(length, chosen, int(INPUTS), record=("qpos", "qvel"), ids=ids)
+        moved = np.concatenate([found["qpos"], found["qvel"]], axis=2)
+        path = np.full((num, length // num_substeps, moved.shape[2]), np.nan)
+        path[slice(None) if ids is None else ids] = moved[:, num_substeps - 1 :: num_substeps]
+        path[~(time > end)] = np.nan
         return path
 
     @functools.cached_property
@@ -196,10 +203,15 @@ def _write_fields(batch: Batch, fields, shapes, leading) -> None:
         batch.set_const()
 
 
-def _write_state(batch: Batch, rows: np.ndarray, num: int) -> None:
-    rows = rows.reshape(num, rows.shape[-1])
+def _finite(rows: np.ndarray) -> np.ndarray | None:
+    """Return which simulations have a finite state [num, ..], None if all have."""
+    finite = np.isfinite(rows).all(axis=1)
+    return None if finite.all() else np.flatnonzero(finite)
+
+
+def _write_state(batch: Batch, rows: np.ndarray) -> None:
     start = 0
     for name in STATE_FIELDS:
-        view = batch.bind(name).reshape(num, -1)
+        view = batch.bind(name).reshape(len(rows), -1)
         view[...] = rows[:, start : start + view.shape[1]]
         start += view.shape[1]

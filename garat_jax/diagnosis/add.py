@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from garat_jax.diagnosis.diagnose import choose_horizon, thin
-from garat_jax.diagnosis.fit import Fit, Problem, fit, settle
+from garat_jax.diagnosis.fit import Fit, count_timestep, fit, settle
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, make_effect
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rank import make_metric
 from garat_jax.diagnosis.results import Estimate
 from garat_jax.diagnosis.segments import choose_grid
@@ -147,4 +148,4 @@ def _best_fit(problem: Problem, before: Fit, effect: Effect, given, free) -> Fit
             if slot.parameter.name in sizes and slot.parameter.name not in given:
                 theta[j] = sizes[slot.parameter.name]
         fits.append(fit(problem, theta, before.start, free))
-    return min(fits, key=lambda fitted: float(fitted.cost.sum()))
+    return count_timestep(problem, min(fits, key=lambda fitted: float(fitted.cost.sum())))

@@ -13,11 +13,12 @@ import plotly.graph_objects as go
 
 from garat_jax.diagnosis import figures
 from garat_jax.diagnosis.diagnose import choose_horizon, thin
-from garat_jax.diagnosis.fit import Problem, settle
+from garat_jax.diagnosis.fit import settle
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, load_model
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.quality import Quality, assess
 from garat_jax.diagnosis.rank import ABOVE_FLOOR, Floor, make_metric, noise_floor
 from garat_jax.diagnosis.replay import Replay, Size, replay_with

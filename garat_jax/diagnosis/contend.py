@@ -3,11 +3,17 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
-from garat_jax.diagnosis.fit import Fit, Problem, fit
+import numpy as np
+
+from garat_jax.diagnosis.fit import Fit, fit
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, simpler_law
 
 CONTENDERS = 4
 """How many candidates are fitted each round, besides those that are like the first."""
+HOPELESS = 8.0
+"""What a candidate is expected to leave unexplained, relative to what the best one left when it was
+fitted, above which it is not fitted; the runner-up always is."""
 CONTENDER_STEPS = 6
 """Gauss-Newton steps of a contender, which starts where screening expects it."""
 
@@ -43,16 +49,22 @@ def fit_contenders(
         return []
     chosen = likely[:CONTENDERS]
     chosen += [s for s in likely[CONTENDERS:] if cosine(s, likely[0]) > EQUIVALENT]
-    contenders = []
+    contenders: list[Contender] = []
     for score in chosen:
+        rival = min((c.fit.cost[problem.fitted].sum() for c in contenders), default=np.inf)
+        hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
+        alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
+        if hopeless and not alike and len(contenders) > 1:
+            continue
         effect = problem.simulator.effects[score.effect]
         say(f"fitting {effect.kind} at {effect.target}")
-        contenders.append(Contender(score, _fit_with(problem, current, score)))
+        contenders.append(Contender(score, _fit_with(problem, current, score, rival)))
     return contenders
 
 
-def _fit_with(problem: Problem, current: Fit, score: Score) -> Fit:
+def _fit_with(problem: Problem, current: Fit, score: Score, rival: float) -> Fit:
     """Fit the selected effects and one more, from where screening puts it."""
     theta = current.theta.copy()
     theta[list(score.start)] = list(score.start.values())
-    return fit(problem, theta, current.start, (*current.free, *score.columns), CONTENDER_STEPS)
+    free = (*current.free, *score.columns)
+    return fit(problem, theta, current.start, free, CONTENDER_STEPS, rival, current.sensitivity)

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
-from garat_jax.diagnosis.fit import Problem
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, signals
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rank import Outcome, explain, make_metric
 from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import Segments, choose_grid, cut, nearby_starts

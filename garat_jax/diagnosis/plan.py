@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from garat_jax.diagnosis.convert import write_csv
-from garat_jax.diagnosis.fit import Problem, StartSpace, linearise
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model

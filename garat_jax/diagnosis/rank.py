@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from garat_jax.diagnosis.contend import Contender, fit_contenders
-from garat_jax.diagnosis.fit import Fit, Problem, StartSpace, block_labels, fit, linearise, settle
+from garat_jax.diagnosis.fit import Fit, count_timestep, fit, settle
+from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels
 from garat_jax.diagnosis.results import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, screen
 from garat_jax.effects import unit_at
@@ -110,9 +111,8 @@ class Floor(NamedTuple):
 def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
     """Estimate the noise floor; a first-order integrator errs by twice what half a step changes."""
     held_out = ~problem.fitted
-    lin = linearise(problem, current.theta, current.start, (), ())
-    change = 2.0 * problem.integrator_error(current.theta, current.start, lin.residual)[..., None]
-    change = StartSpace(lin.start).remove(change)[..., 0]
+    change = problem.integrator_error(current.theta, current.start, current.residual)
+    change = 2.0 * StartSpace(current.sensitivity).remove(change[..., None])[..., 0]
     noise = metric.counted.astype(float)
     return Floor(
         float(np.hypot(metric.error(noise, held_out), metric.error(change, held_out))),
@@ -157,6 +157,8 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         steps.append(Step(candidate, contender.score.effect, current))
         steps, current = _prune(problem, before, steps, current, say)
         floor = noise_floor(problem, metric, current)
+    if len(steps) > 1:
+        current = count_timestep(problem, current)
     selected = tuple(_refreshed(problem, step, current) for step in steps)
     candidates = _without_superfluous(first_round, selected)
     return Outcome(before, current, candidates, tuple(steps), selected, floor.error, adequate)
@@ -186,12 +188,26 @@ def _judge(problem, metric: Metric, current: Fit, scores, contenders: list[Conte
         for index in np.argsort(criterion):
             judged.append(_judge_one(problem, metric, current, contenders, int(index), drawn))
         judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
+        if judged[0][0].passes:
+            judged = _with_timestep(problem, judged)
     fitted = [c.score.effect for c in contenders]
     near = "the model's error is near the noise floor" if not gap else "others explain more"
     for score in scores:
         if score.effect not in fitted:
             sign = "its sign is physically impossible" if not score.possible else near
             judged.append((_unfitted(problem, score, score.excluded or sign), None))
+    return judged
+
+
+def _with_timestep(problem: Problem, judged):
+    """Let the intervals of the first candidate, and of those like it, count the timestep."""
+    shown = {judged[0][0].named, *judged[0][0].indistinguishable_from}
+    for place, (candidate, contender) in enumerate(judged):
+        if candidate.named in shown:
+            fit = count_timestep(problem, contender.fit)
+            estimates = _estimates(problem, contender.score.effect, fit)
+            candidate = dataclasses.replace(candidate, parameters=estimates)
+            judged[place] = (candidate, dataclasses.replace(contender, fit=fit))
     return judged
 
 
@@ -311,7 +327,8 @@ def _prune(problem: Problem, before: Fit, steps: list[Step], current: Fit, say):
     kept = steps
     for step in steps[:-1]:
         say(f"trying without {step.candidate.named}")
-        without = _fit_only(problem, current, [s.effect for s in kept if s.effect != step.effect])
+        others = [s.effect for s in kept if s.effect != step.effect]
+        without = _fit_only(problem, current, others, current.cost[problem.fitted].sum())
         costs = _block_costs(problem, 1.0, [without, current], slice(None))
         drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
         lead = drawn[:, 0] - drawn[:, 1]
@@ -324,20 +341,22 @@ def _prune(problem: Problem, before: Fit, steps: list[Step], current: Fit, say):
     return [s._replace(fit=f) for s, f in zip(kept, (*again, current), strict=True)], current
 
 
-def _fit_only(problem: Problem, current: Fit, effects: Sequence[int]) -> Fit:
+def _fit_only(problem: Problem, current: Fit, effects: Sequence[int], rival=np.inf) -> Fit:
     """Fit again with some of the selected effects, the others back at no effect."""
     slots = problem.simulator.slots
     present = np.asarray([slot.effect in effects for slot in slots])
     theta = np.where(present, current.theta, problem.simulator.base)
-    return fit(problem, theta, current.start, [j for j in current.free if present[j]])
+    free = [j for j in current.free if present[j]]
+    return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
 
 
 def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
     """Where a later effect replaced the first one, say so and put the effects kept first."""
     kept = {c.named: place for place, c in enumerate(selected)}
+    alike = {other for c in selected for other in c.indistinguishable_from}
     corrected = []
     for candidate in candidates:
-        if candidate.passes and candidate.named not in kept:
+        if candidate.passes and candidate.named not in {*kept, *alike}:
             why = f"superfluous with {' and '.join(map(str, kept))}"
             candidate = dataclasses.replace(candidate, passes=False, why=why)
         corrected.append(candidate)

@@ -7,9 +7,10 @@ import numpy as np
 from scipy import stats
 
 from garat_jax.diagnosis.diagnose import choose_horizon, split, thin
-from garat_jax.diagnosis.fit import Problem, fit, settle
+from garat_jax.diagnosis.fit import count_timestep, fit, settle
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, make_effect
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Candidate, Repeated, Sighting
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
@@ -77,7 +78,7 @@ def repeatability(
     for index, recording in enumerate(everything):
         say(f"fitting {recording.name} alone")
         alone = dataclasses.replace(whole, fitted=segments.recording == index)
-        found = fit(alone, theta, start, free)
+        found = count_timestep(alone, fit(alone, theta, start, free))
         for place, j in enumerate(free):
             seen = j not in found.frozen
             numbers = (found.theta[j], found.low[place], found.high[place])

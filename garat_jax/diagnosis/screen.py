@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from garat_jax.diagnosis.fit import (
-    Fit,
+from garat_jax.diagnosis.fit import Fit
+from garat_jax.diagnosis.problem import (
     Linearisation,
     Problem,
     StartSpace,
@@ -134,23 +134,15 @@ def screen(problem: Problem, fit: Fit, skip: Sequence[int] = ()) -> list[Score]:
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SCREENED)]
     problem, start = problem.take(chosen), fit.start[chosen]
-    rows, trials = _plan(problem.simulator, fit.theta, skip)
-    sensitivities = _measure(problem, fit, start, rows, trials)
-    raw: dict[int, Score] = {}
-    for trial in trials:
-        score = _score(problem, sensitivities, rows, trial)
-        best = raw.get(trial.effect)
-        if best is None or (not score.excluded, score.possible, score.share) > (
-            not best.excluded, best.possible, best.share
-        ):  # fmt: skip
-            raw[trial.effect] = score
-    judged = [score for score in raw.values() if not score.excluded]
+    rows, trials, sensitivities = _measure(problem, fit, start, skip)
+    raw = [_score(problem, sensitivities, rows, trial) for trial in trials]
+    judged = [score for score in raw if not score.excluded]
     order = np.argsort([score.p_value for score in judged])
     adjusted, largest = {}, 0.0
     for rank, index in enumerate(order):
         largest = max(largest, min(1.0, judged[index].p_value * (len(judged) - rank)))
         adjusted[judged[index].effect] = largest
-    scores = [dataclasses.replace(s, p_value=adjusted.get(s.effect, 1.0)) for s in raw.values()]
+    scores = [dataclasses.replace(s, p_value=adjusted.get(s.effect, 1.0)) for s in raw]
     simpler = [simpler_law(problem, s, scores) for s in scores]
     place = [s.share if o is None else min(s.share, o.share - 1e-9) for s, o in zip(
         scores, simpler, strict=True
@@ -179,8 +171,8 @@ def cosine(a: Score, b: Score) -> float:
     return float(abs(a.contribution @ b.contribution) / size) if size > 0 else 0.0
 
 
-def _plan(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], list[_Trial]]:
-    """List what to simulate: each candidate at each of its sizes, then its other parameters."""
+def _firsts(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], list[_Trial]]:
+    """List each candidate at each of its sizes, a row for each."""
     rows: list[_Row] = []
     trials = []
     for index, effect in enumerate(simulator.effects):
@@ -194,18 +186,39 @@ def _plan(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], li
             if len(starts) == 1 and len(start) == 1:
                 step = _step_within(simulator, columns[0], theta[columns[0]])
                 start = {columns[0]: theta[columns[0]] + step}
-            first = len(rows)
+            trials.append(_Trial(index, start, (len(rows),), len(starts) == 1))
             rows.append(_Row(columns[0], start, start[columns[0]] - theta[columns[0]], -1))
-            chosen = [first]
-            for j in columns[1:]:
-                base = start[j] if j in start else float(theta[j])
-                step = _step_within(simulator, j, base)
-                alone = effect.independent and len(start) == 1
-                chosen.append(len(rows))
-                values = {j: base + step} if alone else {**start, j: base + step}
-                rows.append(_Row(j, values, step, -1 if alone else first))
-            trials.append(_Trial(index, start, tuple(chosen), len(starts) == 1))
     return rows, trials
+
+
+def _best_sizes(trials: list[_Trial], changes: np.ndarray, residual: np.ndarray) -> list[_Trial]:
+    """Return each candidate's trial that explains most by itself, in the direction tried."""
+    best: dict[int, tuple[tuple[bool, float], _Trial]] = {}
+    for trial in trials:
+        change = changes[:, trial.rows[0]]
+        along = -float(change @ residual) / (float(np.linalg.norm(change)) or np.inf)
+        merit = (trial.is_only or along > 0, abs(along))
+        if trial.effect not in best or merit > best[trial.effect][0]:
+            best[trial.effect] = (merit, trial)
+    return [trial for _, trial in best.values()]
+
+
+def _others(simulator: Simulator, theta: np.ndarray, rows: list[_Row], trials: list[_Trial]):
+    """Add a row for each further parameter of the trials; return all rows and the trials."""
+    rows, extended = list(rows), []
+    for trial in trials:
+        first, effect = trial.rows[0], simulator.effects[trial.effect]
+        columns = [j for j, slot in enumerate(simulator.slots) if slot.effect == trial.effect]
+        chosen = [first]
+        for j in columns[1:]:
+            base = trial.start[j] if j in trial.start else float(theta[j])
+            step = _step_within(simulator, j, base)
+            alone = effect.independent and len(trial.start) == 1
+            chosen.append(len(rows))
+            values = {j: base + step} if alone else {**trial.start, j: base + step}
+            rows.append(_Row(j, values, step, -1 if alone else first))
+        extended.append(trial._replace(rows=tuple(chosen)))
+    return rows, extended
 
 
 def _step_within(simulator: Simulator, column: int, value: float) -> float:
@@ -213,29 +226,44 @@ def _step_within(simulator: Simulator, column: int, value: float) -> float:
     return p.scale if value + p.scale <= p.high else -p.scale
 
 
-def _measure(problem: Problem, fit: Fit, start, rows, trials: list[_Trial]) -> _Sensitivities:
+def _measure(problem: Problem, fit: Fit, start, skip):
+    """Simulate the candidates at all their sizes, then the other parameters of the best size.
+
+    Returns:
+        Rows, a trial for each candidate, and the sensitivities.
+    """
     simulator, segments = problem.simulator, problem.segments
     steps = difference_steps(problem, fit.theta, fit.free, 1e-2)
     lin = linearise(problem, fit.theta, start, fit.free, steps)
-    thetas = np.tile(fit.theta, (len(rows), 1))
-    for theta, row in zip(thetas, rows, strict=True):
-        theta[list(row.values)] = list(row.values.values())
-    moved = problem.whiten_change(simulator.linear_change(thetas, fit.theta, start, segments))
-    below = [moved[row.below] if row.below >= 0 else 0.0 for row in rows]
-    changes = np.stack([change - other for change, other in zip(moved, below, strict=True)])
-    integrator = problem.integrator_error(fit.theta, start, lin.residual)
     remove = _Remover(lin)
-    changes, nuisances = remove(changes), remove(np.stack([integrator, *_offsets(problem)]))
+
+    def change(rows: list[_Row]) -> np.ndarray:
+        thetas = np.tile(fit.theta, (len(rows), 1))
+        for theta, row in zip(thetas, rows, strict=True):
+            theta[list(row.values)] = list(row.values.values())
+        moved = simulator.linear_change(thetas, fit.theta, start, segments)
+        return remove(problem.whiten_change(moved))
+
+    residual = remove(lin.residual[None])[:, 0]
+    firsts, trials = _firsts(simulator, fit.theta, skip)
+    changes = change(firsts)
+    rows, trials = _others(simulator, fit.theta, firsts, _best_sizes(trials, changes, residual))
+    if more := rows[len(firsts) :]:
+        below = [changes[:, row.below] if row.below >= 0 else 0.0 * residual for row in more]
+        changes = np.concatenate([changes, change(more) - np.stack(below, axis=1)], axis=1)
+    integrator = problem.integrator_error(fit.theta, start, lin.residual)
+    nuisances = remove(np.stack([integrator, *_offsets(problem)]))
     delays = [t for t in trials if simulator.effects[t.effect].kind in DELAYS]
     common = [t for t in delays if simulator.effects[t.effect].target == "all"] or delays[:1]
-    return _Sensitivities(
-        residual=remove(lin.residual[None])[:, 0],
+    sensitivities = _Sensitivities(
+        residual=residual,
         changes=changes,
         delay=changes[:, [t.rows[0] for t in common[:1]]],
         offsets=nuisances[:, 1:],
         integrator=nuisances[:, :1],
         labels=block_labels(problem).ravel(),
     )
+    return rows, trials, sensitivities
 
 
 def _offsets(problem: Problem) -> np.ndarray:

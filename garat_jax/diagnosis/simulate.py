@@ -20,7 +20,11 @@ from garat_jax.dynamics import Override
 from garat_jax.effects import Effect, Parameter
 
 BATCH_SIZES = (256, 1024)
-"""Simulations in a batch; each size is compiled once."""
+"""Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
+substep, many simulations share its cost. Each size is compiled once."""
+
+UNOPTIMISED = {"xla_backend_optimization_level": 0}
+"""Of programs that wait for C MuJoCo: to optimise what is around it takes longer than it saves."""
 
 
 class Slot(NamedTuple):
@@ -35,6 +39,18 @@ class Slot(NamedTuple):
     effect: int
     parameter: Parameter
     base: float
+
+
+class Program(NamedTuple):
+    """A compiled program.
+
+    Attributes:
+        run: Takes a batch of (theta, start, ctrl, place), and a path if it looks along one.
+        is_stepped: Whether C MuJoCo is called for every physics substep.
+    """
+
+    run: Callable
+    is_stepped: bool
 
 
 class Simulator:
@@ -63,7 +79,8 @@ class Simulator:
         model = dataclasses.replace(model, overrides=(*model.overrides, timestep))
         with jax.enable_x64(True):
             self._world = model.compile(extra_effects=tuple(candidates))
-        self._own = self._world.effects[: len(self._world.effects) - len(candidates)]
+        own = self._world.effects[: len(self._world.effects) - len(candidates)]
+        self._own = tuple(effect.as_replayed() for effect in own)
         self._substeps = grid.substeps * refine
         self._warm_up = warm_up_steps(grid, self._world.host.model.nu)
         self._on_grid = grid.uniform
@@ -75,12 +92,13 @@ class Simulator:
         )
         self.base = np.asarray([slot.base for slot in self.slots])
         self._owner = np.asarray([slot.effect for slot in self.slots], int)
-        looking = [i for i, e in enumerate(candidates) if e.reads_state or e.notes]
+        replayed = [effect.as_replayed() for effect in candidates]
+        looking = [i for i, e in enumerate(replayed) if e.reads_state or e.notes]
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
-        self._memoryless = tuple(i for i in looking if self._is_memoryless(candidates[i]))
-        own = self._world.replace(effects=self._own)
-        self._any_at_once = dynamics.steps_at_once(own)
-        self._programs: dict[tuple[str, tuple[int, ...]], Callable] = {}
+        self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
+        self._compiler_options = dict(UNOPTIMISED) if self._world.engine == "mujoco" else {}
+        self._any_at_once = dynamics.steps_at_once(self._world.replace(effects=self._own))
+        self._programs: dict[tuple[str, tuple[int, ...]], Program] = {}
 
     @property
     def host(self):
@@ -148,12 +166,12 @@ class Simulator:
         ways: dict[tuple[str, str], list[int]] = {}
         blind, memoryless = {*self._blind}, {*self._blind, *self._memoryless}
         for i, row in enumerate(theta):
-            moved = self._acting(row[None], base)
+            moved = {*self._acting(row[None], base)}
             kinds = " ".join(sorted({self.effects[j].kind for j in moved}))
             acting = {*self._acting(row[None], self.base)}
             if self._any_at_once and acting <= blind:
                 way = ("at once", "")
-            elif self._any_at_once and {*moved} <= memoryless and acting <= memoryless:
+            elif self._any_at_once and moved <= memoryless and acting <= memoryless:
                 way = ("along", kinds)
             else:
                 way = ("stepped", kinds)
@@ -167,39 +185,42 @@ class Simulator:
     def _is_at_once(self, theta: np.ndarray) -> bool:
         return self._any_at_once and {*self._acting(theta[None], self.base)} <= {*self._blind}
 
-    def _program(self, chosen: tuple[int, ...]) -> Callable:
+    def _program(self, chosen: tuple[int, ...]) -> Program:
         """Return the compiled program in which these candidates act."""
         if self._any_at_once and {*chosen} <= {*self._blind}:
             return self._jitted("at once", chosen, self._predict_at_once)
         return self._jitted("stepped", chosen, self._predict)
 
-    def _along(self, chosen: tuple[int, ...]) -> Callable:
+    def _along(self, chosen: tuple[int, ...]) -> Program:
         """Return the compiled program in which these candidates look at a given path."""
         return self._jitted("along", chosen, self._predict_along)
 
-    def _jitted(self, way: str, chosen: tuple[int, ...], function) -> Callable:
+    def _jitted(self, way: str, chosen: tuple[int, ...], function) -> Program:
         if (way, chosen) not in self._programs:
             one = functools.partial(function, chosen)
-            self._programs[way, chosen] = jax.jit(jax.vmap(one))
+            run = jax.jit(jax.vmap(one), compiler_options=self._compiler_options)
+            self._programs[way, chosen] = Program(run, way == "stepped")
         return self._programs[way, chosen]
 
-    def _in_batches(self, run, segments: Segments, theta, start, path=None):
+    def _in_batches(self, program: Program, segments: Segments, theta, start, path=None):
         """Run a program for rows [P] and segments [S]; return signals and paths [P, S, ..].
 
         Rows and segments together are cut into batches of a size that is compiled once.
         """
         num_rows, num_segments = start.shape[:2]
         total = num_rows * num_segments
-        size = BATCH_SIZES[0] if total <= 2 * BATCH_SIZES[0] else BATCH_SIZES[1]
+        size = BATCH_SIZES[program.is_stepped and total > 2 * BATCH_SIZES[0]]
         starts = start.reshape(total, -1)
         found, paths = [], []
         for first in range(0, total, size):
             chosen = np.minimum(np.arange(first, first + size), total - 1)
             row, segment = chosen // num_segments, chosen % num_segments
             more = () if path is None else (path[segment],)
-            inputs = (theta[row], starts[chosen], segments.ctrl[segment], segments.place[segment])
+            begin = starts[chosen]
+            begin[total - first :] = np.nan  # padding: C MuJoCo leaves it out
+            inputs = (theta[row], begin, segments.ctrl[segment], segments.place[segment])
             with jax.enable_x64(True):
-                signals, true = run(*inputs, *more)
+                signals, true = program.run(*inputs, *more)
                 found.append(np.asarray(signals)[..., : segments.measured.shape[2]])
                 paths.append(np.asarray(true))
         return tuple(
@@ -217,7 +238,8 @@ class Simulator:
     def _world_with(self, theta, chosen: Sequence[int]) -> dynamics.Dynamics:
         """Return the model with some of the candidates, at the values of `theta`."""
         candidates = self.with_parameters(theta)
-        return self._world.replace(effects=(*self._own, *(candidates[i] for i in chosen)))
+        acting = (candidates[i].as_replayed() for i in chosen)
+        return self._world.replace(effects=(*self._own, *acting))
 
     def _begin(self, world: dynamics.Dynamics, start):
         num_position = self.host.nq
@@ -246,14 +268,10 @@ class Simulator:
     def _predict(self, chosen: tuple[int, ...], theta, start, ctrl, place):
         """Predict one segment step by step: what the sensors report, and the path on the grid.
 
-        During the warm-up the mechanism is held at its start. It is let go, within a step where
-        need be, as long before the first sample as the sensors are late: what they report there
-        is then the start, and all that they report later was simulated.
+        During the warm-up the mechanism is held at its start.
         """
         world = self._world_with(theta, chosen)
         state = self._begin(world, start)
-        interval = self._substeps * world.timestep
-        late = dynamics.sensor_lag(world) / interval
 
         def whole(state):
             return jnp.concatenate([state.qpos, state.qvel])
@@ -261,12 +279,12 @@ class Simulator:
         def advance(state, inputs):
             index, command = inputs
             moved = dynamics.move(world, state, command, self._substeps)
-            free = jnp.clip(index + 1 - self._warm_up + late, 0.0, 1.0)
+            held = index < self._warm_up
             moved = moved._replace(
-                qpos=jnp.where(free < 1, state.qpos + free * (moved.qpos - state.qpos), moved.qpos),
-                qvel=jnp.where(free < 1, state.qvel + free * (moved.qvel - state.qvel), moved.qvel),
+                qpos=jnp.where(held, state.qpos, moved.qpos),
+                qvel=jnp.where(held, state.qvel, moved.qvel),
             )
-            moved = dynamics.note(world, moved, interval)
+            moved = dynamics.note(world, moved, self._substeps * world.timestep)
             return moved, (whole(dynamics.sensed(world, moved)), whole(moved))
 
         _, paths = jax.lax.scan(advance, state, (jnp.arange(len(ctrl)), ctrl))

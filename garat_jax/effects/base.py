@@ -291,9 +291,9 @@ class Effect(abc.ABC):
         del host, memory
         return state
 
-    def sensor_lag(self) -> jax.Array | float:
-        """Return the seconds by which all sensors are late."""
-        return 0.0
+    def as_replayed(self) -> "Effect":
+        """Return an effect that does the same where recorded commands are replayed, for less."""
+        return self
 
 
 def unit_at(parameter: Parameter, host: mujoco.MjModel, target: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 
 from garat_jax.effects.base import Effect, ModelView, element_id, parameter
-from garat_jax.effects.kinematics import centre_of_mass
+from garat_jax.effects.kinematics import centre_of_mass_jacobian
 
 SMALLEST_MASS = 1e-9
 """Mass [kg] and inertia [kg m²] of the payload's body when the model is compiled."""
@@ -177,16 +177,11 @@ class AirDrag(Effect):
     def apply(self, model: ModelView, state: Any, ctrl: jax.Array, memory: Any):
         """Map the force at the centre of mass onto the degrees of freedom."""
         index = element_id(model.host, "body", self.name)
-
-        def place(displacement: jax.Array) -> jax.Array:
-            return centre_of_mass(model, index, state.qpos, displacement)
-
-        still = jnp.zeros_like(state.qvel)
-        velocity = jax.jvp(place, (still,), (state.qvel,))[1]
+        jacobian = centre_of_mass_jacobian(model, index, state.qpos)
+        velocity = jacobian @ state.qvel
         squared = velocity @ velocity
         speed = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
-        (force,) = jax.vjp(place, still)[1](-self.coefficient * speed * velocity)
-        return ctrl, force, memory
+        return ctrl, jacobian.T @ (-self.coefficient * speed * velocity), memory
 
 
 def moves(host: mujoco.MjModel, body: str) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct
 
 from garat_jax.effects.base import Effect, parameter
+from garat_jax.effects.command import ActuatorDelay
 
 
 @struct.dataclass
@@ -140,9 +141,9 @@ class SensorDelay(Effect):
             qpos=qpos.astype(state.qpos.dtype), qvel=qvel.astype(state.qvel.dtype)
         )
 
-    def sensor_lag(self) -> jax.Array:
-        """Return the delay."""
-        return self.delay
+    def as_replayed(self) -> Effect:
+        """Return late commands: seen from sensors that are late, the commands are."""
+        return ActuatorDelay(target="all", delay=self.delay)
 
 
 def quaternions(host: mujoco.MjModel) -> list[int]:

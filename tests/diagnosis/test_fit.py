@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis.diagnose import make_candidates, split, thin
-from garat_jax.diagnosis.fit import Problem, StartSpace, fit, settle
+from garat_jax.diagnosis.fit import fit, settle
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.problem import Problem, StartSpace
 from garat_jax.diagnosis.screen import cosine, screen
 from garat_jax.diagnosis.segments import choose_grid, cut, signal_noise
 from garat_jax.diagnosis.simulate import Simulator

@@ -13,9 +13,10 @@ import pytest
 from scipy import optimize
 
 from garat_jax.diagnosis.diagnose import make_candidates
-from garat_jax.diagnosis.fit import Problem, fit
+from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from tests.models import PENDULUM, SLIDER, spec

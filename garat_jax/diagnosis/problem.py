@@ -1,0 +1,154 @@
+"""What is fitted to what, and how the residuals change with parameters and initial states.
+
+Residuals are prediction minus measurement, in units of each signal's noise. Sensitivities to the
+parameters and to the initial states come from the same batched simulation.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from garat_jax.diagnosis.segments import Segments, nearby_starts
+from garat_jax.diagnosis.simulate import Simulator
+
+BLOCK = 0.25
+"""Seconds of the shortest block within which errors may be correlated, in robust variances."""
+START_STEP = 1e-4
+"""Finite difference of an initial state, relative to its spread."""
+LARGE = 1e8
+"""Whitened residual that stands for a simulation that diverged."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """What is fitted to what.
+
+    Attributes:
+        simulator: The model with all candidates.
+        finer: The same with half the physics timestep.
+        segments: All segments, those held out among them.
+        fitted: Which segments the parameters may see, [S] bool.
+        interval: Seconds between samples.
+    """
+
+    simulator: Simulator
+    finer: Simulator
+    segments: Segments
+    fitted: np.ndarray
+    interval: float
+
+    def take(self, chosen: np.ndarray) -> "Problem":
+        """Return the problem of some of the segments."""
+        segments = self.segments.take(chosen)
+        return dataclasses.replace(self, segments=segments, fitted=self.fitted[chosen])
+
+    def whiten(self, predicted: np.ndarray) -> np.ndarray:
+        """Return whitened residuals [..., S, N] of predictions [..., S, L, num_signals]."""
+        s = self.segments
+        residual = (predicted - s.measured) * (s.weight[..., None] / s.noise)
+        residual = np.where(np.isfinite(residual), residual, LARGE)
+        return np.clip(residual, -LARGE, LARGE).reshape(*residual.shape[:-2], -1)
+
+    def whiten_change(self, change: np.ndarray) -> np.ndarray:
+        """Return changes of predictions [..., S, L, num_signals], whitened, [..., S, N]."""
+        s = self.segments
+        change = change * (s.weight[..., None] / s.noise)
+        change = np.where(np.isfinite(change), change, 0.0)
+        return np.clip(change, -LARGE, LARGE).reshape(*change.shape[:-2], -1)
+
+    def integrator_error(
+        self, theta: np.ndarray, start: np.ndarray, residual: np.ndarray
+    ) -> np.ndarray:
+        """Return the change of the residuals [S, N] on halving the physics timestep.
+
+        A first-order integrator's error is twice this change.
+        """
+        fine = self.finer.predict(theta[None], start[None], self.segments)
+        return self.whiten(fine)[0] - residual
+
+    def blocks(self) -> np.ndarray:
+        """Return each whitened residual's block within its segment, [N]."""
+        num_samples, num_signals = self.segments.measured.shape[1:]
+        size = max(1, round(BLOCK / self.interval))
+        count = max(1, num_samples // size)
+        block = np.minimum(np.arange(num_samples) * count // num_samples, count - 1)
+        return np.repeat(block, num_signals)
+
+
+class Linearisation(NamedTuple):
+    """Residuals and sensitivities at one point.
+
+    Attributes:
+        residual: [S, N].
+        parameters: Derivatives by the free parameters, [S, N, num_free].
+        start: Derivatives by the initial state's components, in units of `start_unit`,
+            [S, N, nq + nv].
+        start_unit: [nq + nv].
+    """
+
+    residual: np.ndarray
+    parameters: np.ndarray
+    start: np.ndarray
+    start_unit: np.ndarray
+
+
+def linearise(
+    problem: Problem, theta, start, columns, steps, sensitivity: np.ndarray | None = None
+) -> Linearisation:
+    """Simulate the point and one perturbation a column and a component of the initial state.
+
+    Args:
+        problem: What is fitted.
+        theta: All parameters, [num_parameters].
+        start: Initial states, [S, nq + nv].
+        columns: Indices of the parameters to perturb.
+        steps: Their perturbations.
+        sensitivity: Derivatives by the initial states from nearby, [S, N, nq + nv]; they are most
+            of the simulations and change little.
+    """
+    unit = nearby_starts(problem.segments, 1.0)
+    num_start = len(unit) if sensitivity is None else 0
+    thetas = np.tile(theta, (1 + len(columns) + num_start, 1))
+    thetas[1 + np.arange(len(columns)), list(columns)] += steps
+    starts = np.tile(start, (len(thetas), 1, 1))
+    for i in range(num_start):
+        starts[1 + len(columns) + i, :, i] += START_STEP * unit[i]
+    residuals = problem.whiten(problem.simulator.predict(thetas, starts, problem.segments))
+    changes = np.moveaxis(residuals[1:] - residuals[0], 0, -1)
+    parameters = changes[..., : len(columns)] / np.asarray(steps, float)
+    by_start = changes[..., len(columns) :] / START_STEP if sensitivity is None else sensitivity
+    return Linearisation(residuals[0], parameters, by_start, unit)
+
+
+class StartSpace:
+    """The residuals that initial states can make, orthonormal within each segment.
+
+    Attributes:
+        basis: [S, N, nq + nv]; zero where a direction is not excited.
+    """
+
+    def __init__(self, sensitivity: np.ndarray):
+        scale = np.linalg.norm(sensitivity, axis=1, keepdims=True)
+        u, s, _ = np.linalg.svd(sensitivity / np.maximum(scale, 1e-300), full_matrices=False)
+        self.basis = u * (s > 1e-9 * s.max(axis=1, keepdims=True))[:, None, :]
+
+    def remove(self, columns: np.ndarray) -> np.ndarray:
+        """Project columns [S, N, k] onto what no initial state can make."""
+        return columns - self.basis @ (np.swapaxes(self.basis, 1, 2) @ columns)
+
+
+def difference_steps(problem: Problem, theta: np.ndarray, columns, relative: float) -> np.ndarray:
+    """Return finite differences for some parameters that stay within their bounds."""
+    steps = []
+    for j in columns:
+        p = problem.simulator.slots[j].parameter
+        size = relative * max(p.scale, 0.1 * min(abs(theta[j] - p.nominal), abs(theta[j])))
+        steps.append(size if theta[j] + size <= p.high else -size)
+    return np.asarray(steps)
+
+
+def block_labels(problem: Problem) -> np.ndarray:
+    """Return a number for each block of each segment, per whitened residual, [S, N]."""
+    blocks = problem.blocks()
+    return np.arange(len(problem.fitted))[:, None] * (blocks.max() + 1) + blocks
