@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 from garat_jax import __version__
 from garat_jax.commandline import PROGRAM, how_to_go_on, parse
 from garat_jax.commands.console import complain, make_run, print_table, say
-from garat_jax.commands.diagnosis import Compare, Diagnose, Improve, Plan
+from garat_jax.commands.diagnosis import Compare, Diagnose, Ground, Improve, Plan
 from garat_jax.commands.models import Add, Convert, Effects, Export
 from garat_jax.errors import DivergedError, UserError, choose
 
@@ -122,6 +122,7 @@ COMMANDS: dict[str, type[Command]] = {
     "compare": Compare,
     "diagnose": Diagnose,
     "improve": Improve,
+    "ground": Ground,
     "add": Add,
     "export": Export,
     "convert": Convert,

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from garat_jax.agents.ppo import PPOConfig
+from garat_jax.ground import GroundConfig
 from garat_jax.methods.garat import GARATConfig
 from garat_jax.methods.gat import GATConfig
 from garat_jax.transfer import Pair, TransferConfig
@@ -36,3 +37,9 @@ METHODS: dict[str, Callable[..., TransferConfig]] = {
     "garat_paper": garat_paper,
     "gat": gat,
 }
+
+GROUNDING: dict[str, GroundConfig] = {
+    "garat": GroundConfig("garat", GARATConfig(), num_updates=50),  # Desai et al. 2020
+    "gat": GroundConfig("gat", GATConfig(), num_updates=20),
+}
+"""What `garat ground` learns from recordings with."""

@@ -1,4 +1,4 @@
-"""Commands that hold a model against recordings: compare, diagnose, improve, plan."""
+"""Commands that hold a model against recordings: compare, diagnose, improve, ground, plan."""
 
 import dataclasses
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from garat_jax.commands.console import check_files, check_optional, check_out, make_run, say
-from garat_jax.errors import UserError
+from garat_jax.errors import UserError, choose
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,6 +20,10 @@ class Compare:
     """Recordings (CSV, Parquet or NPZ), one a file."""
     map: Annotated[Path | None, arg(metavar="MAP.toml")] = None
     """How the recordings' columns are named, and in which units."""
+    also: Annotated[tuple[Path, ...], arg(metavar="MODEL...")] = ()
+    """Other models to score in the same table, a repaired model card for example."""
+    grounded: Annotated[tuple[Path, ...], arg(metavar="DIR...")] = ()
+    """Runs of `garat ground` to score in the same table."""
     effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
     """Python files with effects of your own."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
@@ -32,13 +36,20 @@ class Compare:
         check_files([self.model], "MODEL")
         check_files(self.data, "DATA")
         check_optional(self.map, "--map")
-        from garat_jax.diagnosis import run_compare
+        check_files(self.also or [self.model], "--also")
+        from garat_jax.diagnosis import load_model, run_compare
         from garat_jax.effects.catalogue import load_catalogue
 
         catalogue = load_catalogue(self.effects)
+        also = [load_model(path, catalogue) for path in self.also]
+        if self.grounded:
+            from garat_jax.ground import load_grounded
+            from garat_jax.presets import GROUNDING
+
+            also += [load_grounded(path, GROUNDING, catalogue) for path in self.grounded]
         out = self.out or Path("runs") / f"compare-{self.model.stem}"
         with make_run(self, out) as run:
-            found = run_compare(self.model, self.data, run, self.map, catalogue)
+            found = run_compare(self.model, self.data, run, self.map, catalogue, also)
         say(str(found))
         say(f"report: {run.root / 'report.html'}")
 
@@ -115,6 +126,69 @@ class Improve:
             done = run_improve(self.model, self.data, self.holdout, run, self.map, catalogue)
         say(str(done))
         say(f"model card: {run.root / 'model.toml'} {done.card}")
+        say(f"report: {run.root / 'report.html'}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Ground:
+    """Learn what physics does not explain: an action transformer of a model, from recordings.
+
+    It writes DIR/summary.json, the transformer's checkpoint, the model and DIR/report.html; `garat
+    compare --grounded DIR` scores it beside other models.
+    """
+
+    model: Annotated[Positional[Path], arg(metavar="MODEL")]
+    """MJCF (.xml) or model card (.toml); a repaired one leaves less to learn."""
+    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA...")]
+    """Recordings (CSV, Parquet or NPZ), one a file."""
+    method: str = "gat"
+    """How to ground: gat or garat."""
+    holdout: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
+    """Recordings to prove the result on; by default some of DATA are held out."""
+    policy: Annotated[Path | None, arg(metavar="FILE.py")] = None
+    """The policy that acted: a function policy(obs, key); cloned from the commands by default."""
+    interval: Annotated[float | None, arg(metavar="SECONDS")] = None
+    """Length of a control step; about 0.02 s by default, in whole samples."""
+    seed: int = 0
+    """Seed of everything random."""
+    map: Annotated[Path | None, arg(metavar="MAP.toml")] = None
+    """How the recordings' columns are named, and in which units."""
+    effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
+    """Python files with effects of your own."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for the results; runs/METHOD-MODEL by default."""
+    force: bool = False
+    """Replace an earlier run in DIR."""
+    resume: bool = False
+    """Go on from the last checkpoint in DIR."""
+
+    def run(self) -> None:
+        """Ground the model."""
+        check_files([self.model], "MODEL")
+        check_files(self.data, "DATA")
+        check_files(self.holdout or self.data, "--holdout")
+        check_optional(self.map, "--map")
+        from garat_jax.effects.catalogue import load_catalogue
+        from garat_jax.ground import run_ground
+        from garat_jax.presets import GROUNDING
+
+        config = choose("method", self.method, GROUNDING)
+        catalogue = load_catalogue(self.effects)
+        out = self.out or Path("runs") / f"{self.method}-{self.model.stem}"
+        with make_run(self, out, seeds=[self.seed], resume=self.resume) as run:
+            done = run_ground(
+                self.model,
+                self.data,
+                self.holdout,
+                config,
+                run,
+                policy=self.policy,
+                interval=self.interval,
+                seed=self.seed,
+                columns=self.map,
+                catalogue=catalogue,
+            )
+        say(done.sentence)
         say(f"report: {run.root / 'report.html'}")
 
 

@@ -8,9 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import plotly.graph_objects as go
 
+from garat_jax import report
 from garat_jax.diagnosis import figures
 from garat_jax.diagnosis.diagnose import choose_horizon, thin
 from garat_jax.diagnosis.fit import settle
@@ -31,6 +33,7 @@ from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE
 from garat_jax.effects.base import element_names
 from garat_jax.effects.catalogue import Catalogue
+from garat_jax.errors import UserError
 from garat_jax.provenance import versions
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
 
@@ -46,6 +49,21 @@ class AtHorizon:
     seconds: float
     error: float
     per_signal: Mapping[str, Mapping[str, Any]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Alternative:
+    """The errors of another model of the same recordings: a repaired or a grounded one.
+
+    Attributes:
+        model: Its file or run directory.
+        error: Over the horizon of the comparison's error.
+        horizons: Over the comparison's horizons.
+    """
+
+    model: str
+    error: float
+    horizons: tuple[AtHorizon, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +84,7 @@ class Comparison:
     residuals: Residuals
     torques: tuple[TorqueError, ...]
     recordings: tuple[Quality, ...]
+    also: tuple[Alternative, ...] = ()
 
     @property
     def near_noise(self) -> bool:
@@ -92,14 +111,21 @@ class Comparison:
                 f"noise {row['noise_floor']:.2g} {row['unit']})"
             )
         lines += [f"  torque at {torque.sentence}" for torque in self.torques]
+        if self.also:
+            lines.append(f"  error over {self.horizon:g} s, % of the signals' spread:")
+            errors = [(self.model, self.error.before), *((a.model, a.error) for a in self.also)]
+            lines += [f"    {100 * error:8.3g}  {model}" for model, error in errors]
         return "\n".join(lines)
 
     def plot(self) -> go.Figure:
         """Draw the error against the horizon, and the noise floor."""
-        drawn = [(h.seconds, h.error) for h in self.horizons]
-        return figures.errors_against_horizon(
-            [("model as it is", figures.BEFORE, drawn)], self.error.noise_floor
-        )
+        named = [("model as it is", self.horizons), *((a.model, a.horizons) for a in self.also)]
+        colours = (figures.BEFORE, *(c for c in report.COLOURS if c != figures.BEFORE))
+        lines = [
+            (name, colours[i % len(colours)], [(h.seconds, h.error) for h in horizons])
+            for i, (name, horizons) in enumerate(named)
+        ]
+        return figures.errors_against_horizon(lines, self.error.noise_floor)
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows."""
@@ -114,6 +140,7 @@ def compare(
     model: Model,
     recordings: Sequence[Recording],
     say: Callable[[str], None] = lambda message: None,
+    also: Sequence[Model] = (),
 ) -> Comparison:
     """Measure the error of a model as it is.
 
@@ -121,9 +148,15 @@ def compare(
         model: The model.
         recordings: What was measured.
         say: Told what is being done.
+        also: Other models to score beside it: repaired or grounded ones.
+
+    Raises:
+        UserError: Another model has other joints or actuators.
     """
     started = time.monotonic()
     host = native_model(model.compile(engine="mujoco"))
+    for other in also:
+        _check_alike(other, model, host)
     qualities = tuple(assess(r, host) for r in recordings)
     torques = compare_torques(host, recordings)
     recordings = thin(recordings)
@@ -137,6 +170,13 @@ def compare(
         say(f"predicting over {horizon:g} s")
         played[horizon] = replay_with(simulator, recordings, grid, horizon)
     floor = _noise_floor(simulator, Simulator(model, (), grid, 2), played[stated], grid)
+    alternatives = []
+    for other in also:
+        say(f"predicting with {other.path}")
+        others = Simulator(other, (), grid)
+        replays = {h: replay_with(others, recordings, grid, h) for h in played}
+        error = replays[stated].error()
+        alternatives.append(Alternative(str(other.path), error, _at_horizons(replays)))
     return Comparison(
         model=str(model.path),
         data=tuple(r.name for r in recordings),
@@ -144,14 +184,12 @@ def compare(
         seconds=time.monotonic() - started,
         error=_errors(played[stated], floor),
         horizon=stated,
-        horizons=tuple(
-            AtHorizon(h, p.error(), {n: s._asdict() for n, s in p.sizes().items()})
-            for h, p in played.items()
-        ),
+        horizons=_at_horizons(played),
         where=tuple(localise(missing_torque(host, recordings))),
         residuals=examine(played[stated], recordings, element_names(host, "actuator")),
         torques=torques,
         recordings=qualities,
+        also=tuple(alternatives),
     )
 
 
@@ -161,6 +199,7 @@ def run_compare(
     run: RunDirectory,
     columns: Path | None = None,
     catalogue: Catalogue = CATALOGUE,
+    also: Sequence[Model] = (),
 ) -> Comparison:
     """Compare a model file with recordings; write compare.json and report.html into a run.
 
@@ -170,6 +209,7 @@ def run_compare(
         run: Where to write.
         columns: Map of the recordings' columns.
         catalogue: The kinds of effect that there are.
+        also: Other models to score beside it: repaired or grounded ones.
 
     Raises:
         UserError: A file cannot be read or does not fit the model.
@@ -178,7 +218,7 @@ def run_compare(
 
     loaded = load_model(model, catalogue)
     recordings = read_recordings(loaded, data, columns)
-    comparison = compare(loaded, recordings, tell)
+    comparison = compare(loaded, recordings, tell, also)
     run.write_json("compare.json", comparison.to_json())
     write_comparison(run, comparison, loaded, recordings)
     return comparison
@@ -199,6 +239,25 @@ def read_recordings(
 def tell(message: str) -> None:
     """Write a line of progress on stderr."""
     sys.stderr.write(f"{message}\n")
+
+
+def _check_alike(other: Model, model: Model, host: mujoco.MjModel) -> None:
+    """Refuse a model that other recordings would belong to."""
+    theirs = other.compile(engine="mujoco").host.model
+    for element in ("joint", "actuator"):
+        wanted, there = element_names(host, element), element_names(theirs, element)
+        if wanted != there:
+            raise UserError(
+                f"{other.path}: its {element}s are {', '.join(there) or 'none'}, those of "
+                f"{model.path} {', '.join(wanted) or 'none'}; expected models of the same machine"
+            )
+
+
+def _at_horizons(played: Mapping[float, Replay]) -> tuple[AtHorizon, ...]:
+    return tuple(
+        AtHorizon(h, p.error(), {n: s._asdict() for n, s in p.sizes().items()})
+        for h, p in played.items()
+    )
 
 
 def _noise_floor(simulator: Simulator, finer: Simulator, played: Replay, grid) -> Floor:

@@ -7,10 +7,11 @@ with `element name field value`, and `[[effect]]` tables with `kind target param
 import dataclasses
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 
@@ -38,6 +39,9 @@ class Model:
         overrides: Changes of the model before it is compiled.
         effects: Physical effects added to it.
         catalogue: The kinds of effect that a diagnosis may find missing in it.
+        transform: A learned action transformer, (qpos and qvel as the sensors report them
+            [nq + nv], command [nu]) -> command sent instead. Predictions have it, `compile` does
+            not.
     """
 
     name: str
@@ -47,6 +51,7 @@ class Model:
     overrides: tuple[Override, ...] = ()
     effects: tuple[Effect, ...] = ()
     catalogue: Catalogue = dataclasses.field(default_factory=lambda: CATALOGUE)
+    transform: Callable[[jax.Array, jax.Array], jax.Array] | None = None
 
     def compile(self, engine: str = "auto", extra_effects: Sequence[Effect] = ()) -> Dynamics:
         """Compile the model, with more effects after its own; see `dynamics.compile`."""

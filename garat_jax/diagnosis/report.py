@@ -18,6 +18,7 @@ from garat_jax.diagnosis.report_data import (
     recordings_section,
     repeatability_section,
     residuals_section,
+    side_by_side_section,
     torque_section,
 )
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Estimate
@@ -139,6 +140,7 @@ def write_comparison(
         lead=comparison.sentence,
         facts=facts,
         sections=[
+            *side_by_side_section(comparison),
             _errors(error, view, everything),
             _traces(view, everything),
             residuals_section(

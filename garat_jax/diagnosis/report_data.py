@@ -1,6 +1,7 @@
 """Sections about the recordings themselves, about what is left, and about measured torques."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import plotly.graph_objects as go
@@ -10,6 +11,9 @@ from garat_jax.diagnosis.residuals import Residuals
 from garat_jax.diagnosis.results import Repeated
 from garat_jax.diagnosis.torque import TorqueError
 from garat_jax.report import COLOURS, SOFT, Figure, Section, Table, styled
+
+if TYPE_CHECKING:
+    from garat_jax.diagnosis.compare import Comparison
 
 MOST_DRAWN = 4
 """Signals whose correlations are drawn, the least random first."""
@@ -183,6 +187,51 @@ def repeatability_section(repeated: Sequence[Repeated]) -> list[Section]:
     caption = "Each recording fitted alone, with its 95 % interval; – where it does not show it."
     text = "\n".join(lines)
     return [Section("The same in every recording?", text, tables=[Table(columns, rows, caption)])]
+
+
+def side_by_side_section(comparison: "Comparison") -> list[Section]:
+    """Return how several models of the same recordings do; nothing if there is only one."""
+    if not comparison.also:
+        return []
+    models = [(comparison.model, comparison.horizons)]
+    models += [(other.model, other.horizons) for other in comparison.also]
+    seconds = [h.seconds for h in comparison.horizons]
+    errors = [(name, *(100 * h.error for h in horizons)) for name, horizons in models]
+    stated = seconds.index(comparison.horizon)
+    by_signal = [
+        (signal, size["unit"], name, size["rmse"], round(size["fit_percent"], 1))
+        for signal in comparison.horizons[0].per_signal
+        for name, horizons in models
+        for size in [horizons[stated].per_signal[signal]]
+    ]
+    return [
+        Section(
+            "Models side by side",
+            "Every model predicts the same segments of the same recordings, each from the initial "
+            "states that fit it best. A model that was fitted to, or learned from, some of these "
+            "recordings has an advantage there: give recordings that it has not seen.",
+            figures=[
+                Figure(
+                    comparison.plot(),
+                    "Error against the horizon of the prediction, as a share of the signals' "
+                    "spread. Dotted: what noise alone would make.",
+                )
+            ],
+            tables=[
+                Table(
+                    ["model", *(f"{s:g} s" for s in seconds)],
+                    errors,
+                    "Error in per cent of the signals' spread, by horizon.",
+                ),
+                Table(
+                    ["signal", "unit", "model", "error", "fit [%]"],
+                    by_signal,
+                    f"Root mean square error of each signal over {comparison.horizon:g} s, in its "
+                    "own unit, and fit, 100 (1 - |y - ŷ| / |y - mean y|).",
+                ),
+            ],
+        )
+    ]
 
 
 def _lag(name: str, lag: float) -> str:

@@ -97,7 +97,9 @@ class Simulator:
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
         self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
         self._compiler_options = dict(UNOPTIMISED) if self._world.engine == "mujoco" else {}
-        self._any_at_once = dynamics.steps_at_once(self._world.replace(effects=self._own))
+        self._transform = model.transform
+        own_alone = self._world.replace(effects=self._own)
+        self._any_at_once = dynamics.steps_at_once(own_alone) and model.transform is None
         self._programs: dict[tuple[str, tuple[int, ...]], Program] = {}
 
     @property
@@ -278,6 +280,8 @@ class Simulator:
 
         def advance(state, inputs):
             index, command = inputs
+            if self._transform is not None:
+                command = self._transform(whole(dynamics.sensed(world, state)), command)
             moved = dynamics.move(world, state, command, self._substeps)
             held = index < self._warm_up
             moved = moved._replace(

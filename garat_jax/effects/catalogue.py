@@ -38,22 +38,31 @@ def load_catalogue(files: Sequence[str | Path] = ()) -> dict[str, type[Effect]]:
         _add(catalogue, [found], origin)
     for file in files:
         path = Path(file)
-        classes = _effects_in(_run(path))
+        classes = _effects_in(run_python(path, "--effects"))
         if not classes:
             raise UserError(f"{path}: holds no effect; expected a class Mine(Effect) with a kind")
         _add(catalogue, classes, str(path))
     return catalogue
 
 
-def _run(path: Path) -> ModuleType:
+def run_python(path: Path, option: str) -> ModuleType:
+    """Run a user's Python file, and return what it defines.
+
+    Args:
+        path: The file.
+        option: The option that named it.
+
+    Raises:
+        UserError: It is not there or fails; one line says where.
+    """
     if not path.is_file():
-        raise UserError(f"--effects: there is no file {path}")
+        raise UserError(f"{option}: there is no file {path}")
     if path.suffix != ".py":
-        raise UserError(f"--effects {path}: expected a Python file (.py)")
-    name = f"garat_user_effects_{path.stem}"
+        raise UserError(f"{option} {path}: expected a Python file (.py)")
+    name = f"garat_user_{option.strip('-')}_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise UserError(f"--effects {path}: Python cannot load it")
+        raise UserError(f"{option} {path}: Python cannot load it")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up there
     try:

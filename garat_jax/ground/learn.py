@@ -1,0 +1,215 @@
+"""Learn an action transformer of a model from recordings, and score it on held-out ones."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from garat_jax import checkpoint, train
+from garat_jax.diagnosis.compare import Comparison, compare
+from garat_jax.diagnosis.diagnose import split
+from garat_jax.diagnosis.measurements import Recording, noise
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.dynamics import Dynamics
+from garat_jax.ground.source import TRANSFORMER, GroundConfig, make_source, with_transformer
+from garat_jax.ground.steps import choose_bounds, control_steps, draw
+from garat_jax.methods.gat import GATConfig
+from garat_jax.methods.grounded import GroundedEnv, Grounding
+from garat_jax.methods.recorded import (
+    RecordedEnv,
+    Steps,
+    as_recorded,
+    as_transitions,
+    clone,
+    exploring,
+    nearest_command,
+    needed_change,
+)
+from garat_jax.methods.transition_error import transition_error
+from garat_jax.runs import RunDirectory
+from garat_jax.train import Trainer
+from garat_jax.transfer import make_method
+from garat_jax.types import Params, Policy
+
+FORMAT = "garat-ground/1"
+REACH = 3.0
+"""Root mean squares of the needed change of a command that a transformer is prepared for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Grounded:
+    """A model with an action transformer, and how it does on recordings that were held out.
+
+    Attributes:
+        model: The model; its predictions have the transformer.
+        comparison: Of the model as it was, with the grounded one beside it.
+        summary: Content of summary.json.
+    """
+
+    model: Model
+    comparison: Comparison
+    summary: Mapping[str, Any]
+
+    @property
+    def sentence(self) -> str:
+        """What grounding did to the held-out error, in one sentence."""
+        before, after = self.comparison.error.before, self.comparison.also[0].error
+        verb = "falls" if after < before else "rises, so the transformer is of no use,"
+        return (
+            f"With the action transformer the held-out error {verb} from {100 * before:.3g} % to "
+            f"{100 * after:.3g} % of the signals' spread; noise alone makes "
+            f"{100 * self.comparison.error.noise_floor:.2g} %."
+        )
+
+
+class Lesson(NamedTuple):
+    """What a transformer is learned from.
+
+    Attributes:
+        env: The source.
+        world: Its dynamics.
+        agent: What acts in it.
+        agent_params: The agent's parameters.
+        seen: Recorded control steps to learn from.
+        unseen: Those to measure the transition error on.
+    """
+
+    env: RecordedEnv
+    world: Dynamics
+    agent: Policy
+    agent_params: Params
+    seen: Steps
+    unseen: Steps
+
+
+def ground(
+    model: Model,
+    recordings: Sequence[Recording],
+    config: GroundConfig,
+    run: RunDirectory,
+    *,
+    holdout: Sequence[Recording] = (),
+    policy: Policy | None = None,
+    interval: float | None = None,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda message: None,
+) -> Grounded:
+    """Learn an action transformer of a model from recordings, and score it on held-out ones.
+
+    Args:
+        model: The source, with the effects that its card has.
+        recordings: What was measured; some are held out as in `diagnose`.
+        config: Settings.
+        run: Where metrics and checkpoints go.
+        holdout: Recordings to prove the result on.
+        policy: What acted in the recordings, `(params, (qpos, qvel), key) -> (command, log_prob)`;
+            cloned from the recorded commands if None.
+        interval: Seconds of a control step; see `choose_bounds`.
+        seed: Seed of networks, rollouts and draws.
+        say: Told what is being done.
+
+    Raises:
+        UserError: As `choose_bounds` and `control_steps`.
+    """
+    fitted, held_out, how = split(recordings, holdout)
+    bounds = choose_bounds(model, fitted, interval)
+    rng = np.random.default_rng(seed)
+    seen = draw(control_steps(fitted, bounds.interval), config.num_transitions, rng)
+    unseen = draw(control_steps(held_out, bounds.interval), config.num_held_out, rng)
+    deviation = np.sqrt(np.mean([noise(r) ** 2 for r in fitted], axis=0))
+    env, world = make_source(model, seen.state, deviation, bounds, config.episode)
+    agent, agent_params = (nearest_command, clone(seen)) if policy is None else (policy, ())
+    trainer = Trainer(run, [seed])
+    say(f"learning an action transformer with {config.method}")
+    lesson = Lesson(env, world, agent, agent_params, seen, unseen)
+    reach = _choose_reach(lesson, trainer)
+    method, transformer, errors = _learn(lesson, config, reach, trainer)
+    grounded = dataclasses.replace(
+        model, path=run.root, transform=with_transformer(method, env, transformer)
+    )
+    comparison = compare(model, held_out, say, [grounded])
+    summary = {
+        "format": FORMAT,
+        "method": config.method,
+        "model": str(model.path),
+        "data": [r.name for r in fitted],
+        "holdout": [r.name for r in held_out],
+        "held_out": how,
+        "policy": "cloned" if policy is None else "given",
+        "control": bounds._asdict(),
+        "reach": reach,
+        "episode": config.episode,
+        "transitions": len(seen.state),
+        "transition_error": errors,
+        "error": {
+            "horizon": comparison.horizon,
+            "model": comparison.error.before,
+            "grounded": comparison.also[0].error,
+            "noise_floor": comparison.error.noise_floor,
+        },
+        "seconds": dataclasses.asdict(trainer.seconds),
+    }
+    return Grounded(grounded, comparison, summary)
+
+
+def _choose_reach(lesson: Lesson, trainer: Trainer) -> float:
+    """Return how far a transformer may have to change an action, in half-ranges, at most 1.
+
+    GARAT's transformer changes it at most so much, and starts with noise of a fixed share of that;
+    GAT's source acts with noise of that size, so that its inverse model knows such commands. Were
+    it the whole range, a small effect would drown in it.
+    """
+    env, world, seen = lesson.env, lesson.world, lesson.seen
+    options = train.compiler_options(world)
+    change = trainer.call(lambda w: needed_change(env, w, seen), world, options=options)
+    return float(min(1.0, np.max(REACH * change / ((env.action_high - env.action_low) / 2))))
+
+
+def _learn(lesson: Lesson, config: GroundConfig, reach: float, trainer: Trainer):
+    """Learn a transformer; return the method, its parameters, and held-out transition errors."""
+    env, world, agent, agent_params, seen, unseen = lesson
+    if isinstance(config.learner, GATConfig):
+        agent = exploring(env, agent, reach)
+    method = make_method(env, agent, config.reaching(reach))
+    options = train.compiler_options(world)
+    target = as_transitions(env, seen)
+    keys = jax.random.split(jax.random.key(trainer.seeds[0]), 1)
+    init = jax.vmap(method.init, (0, None, None, None))
+    start = trainer.call(init, keys, world, agent_params, target, options=options)
+    quiet = env.without_noise()  # the recorded states have theirs already
+    recorded = trainer.call(lambda w: as_recorded(quiet, w, unseen), world, options=options)
+    errors = _errors(quiet, world, recorded, trainer, options)
+
+    def update(state, params):
+        world, agent_params, target, recorded = params
+        state, metrics = method.step(state, world, agent_params, target)
+        grounding = Grounding(world, state.transformer.policy)
+        error = transition_error(GroundedEnv(quiet, method.transform), grounding, recorded)
+        return state, metrics | {"error": error, "error_ratio": error / errors["source"]}
+
+    params = (world, agent_params, target, recorded)
+    step = jax.vmap(update, (0, None))
+    state = trainer.train("grounding", step, start, params, config.num_updates, options)
+    transformer = jax.tree.map(lambda x: x[0], state.transformer.policy)
+    folder = trainer.run.path(TRANSFORMER)
+    if checkpoint.latest_step(folder) is None:
+        checkpoint.save(folder, config.num_updates, transformer)
+    *_, last = (line for line in trainer.run.metrics() if line["stage"] == "grounding")
+    return method, transformer, errors | {"grounded": last["error"][0]}
+
+
+def _errors(env: RecordedEnv, world: Dynamics, recorded, trainer: Trainer, options):
+    """Return the transition errors of the source, and of the source with every action zero."""
+
+    def both(world, recorded):
+        idle = recorded.transitions._replace(action=jnp.zeros_like(recorded.transitions.action))
+        return {
+            "source": transition_error(env, world, recorded),
+            "zero_action": transition_error(env, world, recorded._replace(transitions=idle)),
+        }
+
+    found = trainer.call(both, world, recorded, options=options)
+    return {name: float(error) for name, error in found.items()}

@@ -1,0 +1,169 @@
+"""The command `garat ground`: read the files, learn, write the run with its report."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import plotly.graph_objects as go
+
+from garat_jax import report
+from garat_jax.diagnosis.compare import read_recordings, tell
+from garat_jax.diagnosis.export import copy_model
+from garat_jax.diagnosis.model_card import Model, load_model, save_card
+from garat_jax.diagnosis.report_data import side_by_side_section
+from garat_jax.effects import CATALOGUE
+from garat_jax.effects.catalogue import Catalogue, run_python
+from garat_jax.errors import UserError
+from garat_jax.ground.learn import Grounded, ground
+from garat_jax.ground.source import CARD, SUMMARY, GroundConfig
+from garat_jax.report import Fact, Figure, Reproduce, Section
+from garat_jax.runs import RunDirectory, finite_or_null, to_plain
+from garat_jax.types import Params, Policy
+
+
+def run_ground(
+    model: Path,
+    data: Sequence[Path],
+    holdout: Sequence[Path],
+    config: GroundConfig,
+    run: RunDirectory,
+    *,
+    policy: Path | None = None,
+    interval: float | None = None,
+    seed: int = 0,
+    columns: Path | None = None,
+    catalogue: Catalogue = CATALOGUE,
+) -> Grounded:
+    """Ground a model file with recordings.
+
+    It writes summary.json, compare.json, metrics.jsonl, the checkpoint `transformer/`, report.html,
+    and the model that it belongs to: model.toml with its files in `model/`.
+
+    Args:
+        model: MJCF or model card.
+        data: Recordings to learn from.
+        holdout: Recordings to prove the result on; some of `data` are held out if there are none.
+        config: Settings.
+        run: Where to write.
+        policy: Python file with the policy that acted; see `load_policy`.
+        interval: Seconds of a control step; see `choose_bounds`.
+        seed: Seed of everything random.
+        columns: Map of the recordings' columns.
+        catalogue: The kinds of effect that there are.
+
+    Raises:
+        UserError: A file cannot be read, does not fit the model, or cannot be copied.
+    """
+    loaded = load_model(model, catalogue)
+    acting = load_policy(policy, loaded) if policy else None
+    recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
+    run.record_settings(config)
+    done = ground(
+        loaded,
+        recordings,
+        config,
+        run,
+        holdout=held_out,
+        policy=acting,
+        interval=interval,
+        seed=seed,
+        say=tell,
+    )
+    copied = copy_model(loaded, run.path("model"))
+    save_card(run.path(CARD), dataclasses.replace(loaded, mjcf=copied))
+    run.write_json("compare.json", done.comparison.to_json())
+    run.write_json(SUMMARY, finite_or_null(to_plain(done.summary)))
+    _write_report(run, done, loaded.name)
+    return done
+
+
+def load_policy(path: Path, model: Model) -> Policy:
+    """Read a policy from a Python file, which is run: `def policy(obs, key)` that JAX can trace.
+
+    It is given (qpos, qvel) as the sensors report them, [nq + nv], and a PRNG key, and returns the
+    command, [nu].
+
+    Raises:
+        UserError: The file fails, has no such function, or the function returns something else.
+    """
+    function = getattr(run_python(path, "--policy"), "policy", None)
+    if not callable(function):
+        raise UserError(f"{path}: holds no policy; expected a function policy(obs, key)")
+    host = model.compile(engine="mujoco").host.model
+    obs = jax.ShapeDtypeStruct((host.nq + host.nv,), "float32")
+    try:
+        command = jax.eval_shape(function, obs, jax.random.key(0))
+    except Exception as error:
+        line = " ".join(str(error).split())
+        raise UserError(f"{path}: policy(obs, key): {type(error).__name__}: {line}") from error
+    if getattr(command, "shape", None) != (host.nu,):
+        raise UserError(
+            f"{path}: policy(obs, key) returns {command}; expected an array of {host.nu} "
+            f"command{'s' if host.nu > 1 else ''}, shape ({host.nu},)"
+        )
+
+    def policy(params: Params, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        del params
+        return jnp.asarray(function(obs, key)), jnp.zeros(())
+
+    return policy
+
+
+def _write_report(run: RunDirectory, done: Grounded, name: str) -> None:
+    summary, comparison = done.summary, done.comparison
+    errors = summary["transition_error"]
+    report.write(
+        run.path("report.html"),
+        kind="A model grounded in measurements",
+        title=f"{summary['method']} on {name}",
+        lead=done.sentence,
+        facts=[
+            Fact(f"{100 * comparison.error.before:.3g} %", "held-out error of the model as it is"),
+            Fact(f"{100 * comparison.also[0].error:.3g} %", "with the action transformer"),
+            Fact(f"{100 * comparison.error.noise_floor:.2g} %", "what noise alone would make"),
+            Fact(str(summary["transitions"]), "recorded control steps to learn from"),
+        ],
+        sections=[
+            *side_by_side_section(comparison),
+            Section(
+                "One control step at a time",
+                "From each held-out state the recorded command is held for one control step of "
+                f"{1000 * summary['control']['interval']:.3g} ms in the source, with and without "
+                "the transformer. The error is the distance of the next state (qpos, qvel) from "
+                "the recorded one (L2), the sensors' noise included. A transformer is learned on "
+                "such steps; whether it helps to predict longer motion is said above.",
+                figures=[
+                    Figure(
+                        _curve(run, errors),
+                        "Mean error of a held-out step over the updates of the transformer. "
+                        "Dashed: the model as it is, and the model with every command zero.",
+                    )
+                ],
+            ),
+        ],
+        reproduce=Reproduce.from_config(run.read_json("config.json")),
+    )
+
+
+def _curve(run: RunDirectory, errors) -> go.Figure:
+    lines = [line for line in run.metrics() if line["stage"] == "grounding"]
+    figure = go.Figure()
+    figure.add_scatter(
+        x=[line["step"] for line in lines],
+        y=[line["error"][0] for line in lines],
+        name="with the transformer",
+        line={"color": report.COLOURS[0], "width": 2},
+    )
+    labels = {"source": "model as it is", "zero_action": "every command zero"}
+    for colour, (name, label) in zip(report.COLOURS[1:], labels.items(), strict=False):
+        figure.add_scatter(
+            x=[lines[0]["step"], lines[-1]["step"]],
+            y=[errors[name]] * 2,
+            name=label,
+            mode="lines",
+            line={"color": colour, "width": 1.5, "dash": "dash"},
+        )
+    figure = report.styled(figure, xaxis_title="update", yaxis_title="error of one step")
+    return figure.update_yaxes(rangemode="tozero")

@@ -1,0 +1,123 @@
+"""A model with an action transformer before it: made after learning, read back from a run."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from garat_jax import checkpoint
+from garat_jax.diagnosis.model_card import Model, load_model
+from garat_jax.dynamics import Dynamics, Override
+from garat_jax.effects import CATALOGUE
+from garat_jax.effects.catalogue import Catalogue
+from garat_jax.errors import UserError, choose
+from garat_jax.ground.steps import Bounds
+from garat_jax.methods.garat import GARATConfig
+from garat_jax.methods.gat import GATConfig
+from garat_jax.methods.recorded import RecordedEnv, Steps, as_transitions, clone, nearest_command
+from garat_jax.runs import RunDirectory
+from garat_jax.transfer import make_method
+
+CARD, SUMMARY, TRANSFORMER = "model.toml", "summary.json", "transformer"
+"""What a run holds: the model's card, what came out, and the folder of the checkpoint."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GroundConfig:
+    """Settings of grounding on measurements; presets give tuned ones.
+
+    Attributes:
+        method: Its name.
+        learner: Its settings.
+        num_updates: Of the action transformer.
+        num_transitions: Most recorded control steps that it learns from, drawn at random.
+        num_held_out: Most held-out control steps that the transition error is measured on.
+        episode: Seconds that a rollout in the source goes on from a recorded state.
+    """
+
+    method: str
+    learner: GARATConfig | GATConfig
+    num_updates: int
+    num_transitions: int = 5000  # Desai et al. 2020
+    num_held_out: int = 2000
+    episode: float = 0.5
+
+    def reaching(self, reach: float) -> GARATConfig | GATConfig:
+        """Return the learner's settings, GARAT's with a reach in half-ranges of the action."""
+        if isinstance(self.learner, GATConfig):
+            return self.learner
+        return dataclasses.replace(self.learner, reach=reach)
+
+
+def make_source(
+    model: Model, states: np.ndarray, noise: np.ndarray, bounds: Bounds, episode: float
+) -> tuple[RecordedEnv, Dynamics]:
+    """Build the source: the model, stepped by control intervals from recorded states.
+
+    Args:
+        model: The model.
+        states: Where episodes begin, [N, nq + nv].
+        noise: Standard deviation of the sensors' noise, [nq + nv].
+        bounds: Control interval and range of commands.
+        episode: Seconds of an episode.
+    """
+    host = model.compile(engine="mujoco").host.model
+    substeps = max(1, int(np.ceil(bounds.interval / host.opt.timestep - 1e-6)))
+    timestep = Override("option", "", "timestep", bounds.interval / substeps)
+    world = dataclasses.replace(model, overrides=(*model.overrides, timestep)).compile()
+    length = max(1, round(episode / bounds.interval))
+    return RecordedEnv(states, noise, host.nq, bounds.low, bounds.high, substeps, length), world
+
+
+def load_grounded(
+    root: Path, configs: Mapping[str, GroundConfig], catalogue: Catalogue = CATALOGUE
+) -> Model:
+    """Read a run of `garat ground`: its model, with the action transformer before it.
+
+    Args:
+        root: The run directory.
+        configs: The settings of each method by name.
+        catalogue: The kinds of effect that there are.
+
+    Raises:
+        UserError: There is no such run, or it was made with other settings.
+    """
+    run = RunDirectory.open(root)
+    if checkpoint.latest_step(root / TRANSFORMER) is None or not (root / SUMMARY).is_file():
+        raise UserError(f"{root} holds no action transformer; expected a run of garat ground")
+    summary = run.read_json(SUMMARY)
+    config = choose("method", summary["method"], configs)
+    model = load_model(root / CARD, catalogue)
+    control = summary["control"]
+    bounds = Bounds(control["interval"], np.asarray(control["low"]), np.asarray(control["high"]))
+    host = model.compile(engine="mujoco").host.model
+    start = np.zeros((1, host.nq + host.nv))
+    start[0, : host.nq] = host.qpos0
+    env, world = make_source(model, start, 0 * start[0], bounds, summary["episode"])
+    steps = Steps(start, np.zeros((1, host.nu)), start)
+    method = make_method(env, nearest_command, config.reaching(summary["reach"]))
+    shapes = jax.eval_shape(
+        method.init, jax.random.key(0), world, clone(steps), as_transitions(env, steps)
+    )
+    like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes.transformer.policy)
+    transformer = checkpoint.restore(root / TRANSFORMER, like)
+    return dataclasses.replace(
+        model, path=root, transform=with_transformer(method, env, transformer)
+    )
+
+
+def with_transformer(method, env: RecordedEnv, transformer):
+    """Return `(state, command) -> command` in the precision that it is called with."""
+    params = jax.tree.map(
+        lambda x: np.asarray(x, float) if jnp.issubdtype(x.dtype, jnp.floating) else np.asarray(x),
+        transformer,
+    )
+
+    def transform(state: jax.Array, command: jax.Array) -> jax.Array:
+        key = jax.random.key(0)  # unused: a transformer's mean draws nothing
+        return env.clip(method.transform(params, state, env.clip(command), key))
+
+    return transform

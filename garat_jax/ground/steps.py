@@ -1,0 +1,111 @@
+"""Control steps in recordings: how long they are, and how far their commands may go."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.errors import UserError
+from garat_jax.methods.recorded import Steps
+
+INTERVAL = 0.02
+"""Seconds of a control step, unless samples are farther apart: long enough for a change of state to
+stand out of the sensors' noise, short against a robot joint's motion."""
+
+
+class Bounds(NamedTuple):
+    """Control steps: seconds of one, and the range of its commands, [nu] each."""
+
+    interval: float
+    low: np.ndarray
+    high: np.ndarray
+
+
+def choose_bounds(
+    model: Model, recordings: Sequence[Recording], interval: float | None = None
+) -> Bounds:
+    """Choose the control interval and the range of commands that the transformer may use.
+
+    The range is the recorded one, widened by half of itself to each side, within `ctrlrange`.
+
+    Args:
+        model: The model.
+        recordings: What was measured.
+        interval: Seconds of a control step; by default about `INTERVAL`, in whole samples.
+
+    Raises:
+        UserError: The model has no actuator, the interval is shorter than a sample, or an actuator
+            has neither a `ctrlrange` nor commands that change.
+    """
+    host = model.compile(engine="mujoco").host.model
+    if host.nu == 0:
+        raise UserError(
+            f"{model.path} has no actuator, and an action transformer changes commands; "
+            "garat diagnose finds what is missing in passive motion"
+        )
+    sample = float(np.median(np.concatenate([np.diff(r.time) for r in recordings])))
+    if interval is None:
+        interval = sample * max(1, round(INTERVAL / sample))
+    if interval < (1 - 1e-3) * sample:
+        raise UserError(f"--interval {interval:g}: expected at least a sample, {sample:.4g} s")
+    ctrl = np.concatenate([r.ctrl for r in recordings])
+    low, high = ctrl.min(axis=0), ctrl.max(axis=0)
+    room, limited = (high - low) / 2, host.actuator_ctrllimited.astype(bool)
+    for i in np.flatnonzero(room == 0):
+        if not limited[i]:
+            raise UserError(
+                f"the command of actuator {host.actuator(i).name!r} never changes and it has no "
+                "ctrlrange, so nothing says how far commands may go: give it a ctrlrange"
+            )
+    room = np.where(room == 0, np.inf, room)
+    reach = np.where(limited[:, None], host.actuator_ctrlrange, [-np.inf, np.inf])
+    return Bounds(
+        interval, np.maximum(low - room, reach[:, 0]), np.minimum(high + room, reach[:, 1])
+    )
+
+
+def control_steps(recordings: Sequence[Recording], interval: float) -> Steps:
+    """Cut recordings into control steps, one from each sample on.
+
+    The command of a step is the mean of those held during it; its end is interpolated between
+    samples where there is none.
+
+    Args:
+        recordings: What was measured.
+        interval: Seconds of a step.
+
+    Raises:
+        UserError: No recording is as long.
+    """
+    parts = []
+    for recording in recordings:
+        for a, b in recording.spans:
+            time, state = recording.time[a:b], _state(recording)[a:b]
+            held = np.diff(time)[:, None] * recording.ctrl[a : b - 1]
+            integral = np.concatenate([np.zeros((1, held.shape[1])), np.cumsum(held, axis=0)])
+            starts = time + interval <= time[-1] + 1e-6 * interval
+            ends = time[starts] + interval
+            travelled = _interpolate(ends, time, integral) - integral[starts]
+            parts.append(
+                Steps(state[starts], travelled / interval, _interpolate(ends, time, state))
+            )
+    steps = Steps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    if not len(steps.state):
+        raise UserError(f"no recording has {interval:g} s in a row; give a smaller --interval")
+    return steps
+
+
+def _state(recording: Recording) -> np.ndarray:
+    return np.concatenate([recording.qpos, recording.qvel], axis=1)
+
+
+def _interpolate(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
+
+
+def draw(steps: Steps, most: int, rng: np.random.Generator) -> Steps:
+    """Return at most so many of the steps, drawn at random."""
+    chosen = rng.permutation(len(steps.state))[:most]
+    return Steps(*(column[chosen] for column in steps))

@@ -1,0 +1,272 @@
+"""Grounding on measurements: what is learned from, and that it reaches the table of `compare`."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from garat_jax import cli, presets
+from garat_jax.diagnosis import compare, load_model
+from garat_jax.diagnosis.compare import read_recordings
+from garat_jax.diagnosis.hidden import make_recordings
+from garat_jax.diagnosis.replay import replay
+from garat_jax.effects import CATALOGUE
+from garat_jax.errors import UserError
+from garat_jax.ground import GroundConfig, ground, load_grounded
+from garat_jax.ground.run import load_policy
+from garat_jax.ground.source import make_source
+from garat_jax.ground.steps import choose_bounds, control_steps
+from garat_jax.methods.gat import GATConfig
+from garat_jax.methods.recorded import Steps, clone, nearest_command, needed_change
+from garat_jax.runs import RunDirectory
+from tests import models
+
+SMALL = GroundConfig(
+    "gat", GATConfig(num_envs=16, num_steps=25), num_updates=3, num_transitions=300, num_held_out=50
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A model, and recordings of a machine whose motor is off by a constant torque."""
+    folder = tmp_path_factory.mktemp("recorded")
+    path = folder / "pendulum.xml"
+    path.write_text(models.PENDULUM)
+    made = make_recordings(
+        path, folder / "data", 3, num_recordings=3, seconds=1.0, rate=125.0, kind="torque_offset"
+    )
+    return path, [*made.fit, *made.holdout], made.parameters["torque"]
+
+
+@pytest.fixture(scope="module")
+def read(recorded):
+    model = load_model(recorded[0])
+    return model, read_recordings(model, recorded[1])
+
+
+def irregular(read):
+    """Return a recording of five samples and a gap, the command one step of a ramp in each."""
+    time = np.asarray([0.0, 0.01, 0.03, 0.04, 0.05, 1.0, 1.01])
+    state = np.stack([time, 2 * time], axis=1)
+    return dataclasses.replace(
+        read[1][0],
+        time=time,
+        qpos=state[:, :1],
+        qvel=state[:, 1:],
+        ctrl=np.arange(7.0)[:, None],
+        spans=((0, 5), (5, 7)),
+    )
+
+
+def test_control_steps_hold_the_mean_command_and_never_cross_a_gap(read):
+    steps = control_steps([irregular(read)], 0.02)
+    np.testing.assert_allclose(steps.state[:, 0], [0.0, 0.01, 0.03])
+    np.testing.assert_allclose(steps.next_state - steps.state, [[0.02, 0.04]] * 3)
+    # 10 ms of command 0, then 10 ms of 1; 20 ms of 1; 10 ms of 2, then 10 ms of 3.
+    np.testing.assert_allclose(steps.action[:, 0], [0.5, 1.0, 2.5], atol=1e-12)
+
+
+def test_recordings_shorter_than_a_step_are_refused(read):
+    with pytest.raises(UserError, match=r"no recording has 3 s in a row; .* smaller --interval"):
+        control_steps(read[1], 3.0)
+
+
+def test_commands_may_go_half_their_range_beyond_it_within_ctrlrange(read):
+    model, recordings = read
+    ctrl = np.linspace(-1.0, 2.0, len(recordings[0].time))[:, None]
+    bounds = choose_bounds(model, [dataclasses.replace(recordings[0], ctrl=ctrl)])
+    assert (bounds.low, bounds.high) == (pytest.approx(-2.5), pytest.approx(3.0))
+    assert bounds.interval == pytest.approx(0.016)  # two samples, the nearest to 0.02 s
+
+
+def test_what_cannot_be_grounded_is_refused(read, tmp_path):
+    model, recordings = read
+    with pytest.raises(UserError, match=r"--interval 0.001: expected at least a sample, 0.008 s"):
+        choose_bounds(model, recordings, 0.001)
+    passive = tmp_path / "passive.xml"
+    passive.write_text(models.TUMBLER)
+    with pytest.raises(UserError, match=r"passive.xml has no actuator, .* garat diagnose"):
+        choose_bounds(load_model(passive), recordings)
+    free = tmp_path / "free.xml"
+    free.write_text(models.PENDULUM.replace('ctrlrange="-3 3" ctrllimited="true"', ""))
+    still = [dataclasses.replace(r, ctrl=0 * r.ctrl) for r in recordings]
+    with pytest.raises(UserError, match="'motor' never changes and it has no ctrlrange"):
+        choose_bounds(load_model(free), still)
+
+
+def test_the_source_begins_where_the_sensors_reported_it(read):
+    model, recordings = read
+    offset = CATALOGUE["encoder_offset"](target="joint/hinge", offset=0.3)
+    bounds = choose_bounds(model, recordings)
+    steps = control_steps(recordings, bounds.interval)
+    noise = np.asarray([1e-3, 1e-2])
+    env, world = make_source(
+        dataclasses.replace(model, effects=(offset,)), steps.state, noise, bounds, 0.5
+    )
+    state = env.at(world, jnp.asarray(steps.state[7]))
+    np.testing.assert_allclose(state.obs, steps.state[7], atol=1e-6)
+    np.testing.assert_allclose(state.physics.qpos, steps.state[7, :1] - 0.3, atol=1e-6)
+    keys = jax.random.split(jax.random.key(0), 2000)
+    obs = np.asarray(jax.vmap(env.reset, (None, 0))(world, keys).obs)
+    nearest = np.abs(obs[:, None] - steps.state).min(axis=1)
+    assert (nearest < 5 * noise).all()
+    assert env.episode_length == 31
+
+
+def test_the_needed_change_of_a_command_is_the_hidden_torque(read, recorded):
+    model, recordings = read
+    bounds = choose_bounds(model, recordings)
+    steps = control_steps(recordings, bounds.interval)
+    env, world = make_source(model, steps.state, np.asarray([1e-3, 1e-2]), bounds, 0.5)
+    change = jax.jit(lambda w: needed_change(env, w, steps))(world)
+    assert change == pytest.approx(abs(recorded[2]), rel=0.25)  # noise is in it
+
+
+def test_the_cloned_policy_does_what_was_done_in_a_state_nearby():
+    rng = np.random.default_rng(0)
+    state = rng.uniform(-1, 1, (500, 2)) * [1.0, 100.0]
+    action = np.sign(state[:, :1])  # a switch: a mean would be neither
+    params = clone(Steps(state, action, state))
+    keys = jax.random.split(jax.random.key(0), 50)
+    for angle, wanted in ((0.5, 1.0), (-0.5, -1.0)):
+        obs = np.asarray([angle, 30.0], np.float32)
+        drawn, _ = jax.vmap(nearest_command, (None, None, 0))(params, obs, keys)
+        assert (drawn == wanted).all()
+
+
+def test_a_transform_acts_before_the_model_as_its_equal_effect(read, recorded):
+    model, recordings = read
+    torque = recorded[2]
+    effect = CATALOGUE["torque_offset"](target="joint/hinge", torque=torque)
+    shifted = dataclasses.replace(model, transform=lambda state, command: command + torque)
+    by_effect = dataclasses.replace(model, effects=(effect,))
+    (one,), (other,) = (replay(m, recordings, [0.5]) for m in (shifted, by_effect))
+    np.testing.assert_allclose(one.predicted, other.predicted, atol=1e-5)
+    found = compare(model, recordings, also=[shifted])
+    assert found.also[0].error < 0.5 * found.error.before
+    assert len(found.plot().data) == 2
+
+
+def test_models_of_other_machines_are_not_compared(read, tmp_path):
+    arm = tmp_path / "arm.xml"
+    arm.write_text(models.ARM)
+    with pytest.raises(UserError, match=r"its joints are shoulder, elbow, those of .* hinge"):
+        compare(*read, also=[load_model(arm)])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1", "holds no policy; expected a function policy"),
+        ("def policy(obs, key): return obs", r"expected an array of 1 command, shape \(1,\)"),
+        ("def policy(obs, key): return obs[9:].nothing", "AttributeError"),
+        ("def policy(obs", "line 1: SyntaxError"),
+    ],
+)
+def test_a_wrong_policy_is_refused(read, tmp_path, text, message):
+    (tmp_path / "mine.py").write_text(text)
+    with pytest.raises(UserError, match=message):
+        load_policy(tmp_path / "mine.py", read[0])
+
+
+@pytest.fixture(scope="module")
+def grounded(recorded, tmp_path_factory):
+    """A run of `garat ground` with few updates; its actor is a policy in a file."""
+    folder = tmp_path_factory.mktemp("grounded")
+    policy = folder / "mine.py"
+    policy.write_text(
+        "import jax.numpy as jnp\ndef policy(obs, key): return jnp.sin(9 * obs[:1])\n"
+    )
+    names = [str(file) for file in recorded[1]]
+    command = ["ground", str(recorded[0]), *names, "--policy", str(policy)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(presets.GROUNDING, "gat", SMALL)
+        assert cli.main([*command, "--out", str(folder / "gat")]) == 0
+    return folder / "gat"
+
+
+def test_a_run_holds_what_scripts_read(grounded):
+    summary = json.loads((grounded / "summary.json").read_text())
+    assert (summary["data"], summary["holdout"]) == (
+        ["recording_0.csv", "recording_1.csv"],
+        ["recording_2.csv"],
+    )
+    assert summary["policy"] == "given"
+    found = json.loads((grounded / "compare.json").read_text())
+    assert found["also"][0]["error"] == summary["error"]["grounded"]
+    assert len((grounded / "metrics.jsonl").read_text().splitlines()) == SMALL.num_updates
+    page = (grounded / "report.html").read_text()
+    assert "With the action transformer the held-out error" in page
+    assert "One control step at a time" in page
+
+
+def test_a_run_is_read_back(grounded):
+    model = load_grounded(grounded, {"gat": SMALL})
+    assert model.transform is not None
+    control = json.loads((grounded / "summary.json").read_text())["control"]
+    state, command = jnp.asarray([0.3, -1.0]), jnp.asarray([0.2])
+    sent = model.transform(state, command)
+    assert sent.shape == (1,)
+    assert control["low"][0] <= sent[0] <= control["high"][0]
+    assert sent[0] != command[0]
+
+
+@pytest.mark.slow
+def test_grounding_reaches_the_table_of_compare(recorded, grounded, tmp_path, capsys):
+    model, files, torque = recorded
+    card = model.parent / "repaired.toml"
+    card.write_text(
+        f'format = "garat-model/1"\nmjcf = "{model.name}"\n[[effect]]\nkind = "torque_offset"\n'
+        f'target = "joint/hinge"\nparameters = {{ torque = {torque} }}\n'
+    )
+    out = tmp_path / "compare"
+    others = ["--also", str(card), "--grounded", str(grounded), "--out", str(out)]
+    assert cli.main(["compare", str(model), str(files[-1]), *others]) == 0
+    content = json.loads((out / "compare.json").read_text())
+    repaired, other = content["also"]
+    assert (repaired["model"], other["model"]) == (str(card), str(grounded))
+    assert repaired["error"] < 0.5 * content["error"]["before"]
+    summary = json.loads((grounded / "summary.json").read_text())
+    assert other["error"] == pytest.approx(summary["error"]["grounded"], rel=1e-6)
+    assert "Models side by side" in (out / "report.html").read_text()
+    assert f"{grounded}\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["compare", "{model}", "{data}", "--grounded", "nowhere"], "nowhere holds no run"),
+        (["compare", "{model}", "{data}", "--also", "no.toml"], "--also: there is no file no.toml"),
+        (["ground", "{model}", "{data}", "--method", "gad"], "did you mean gat"),
+        (["ground", "{model}", "{data}", "--policy", "no.py"], "--policy: there is no file no.py"),
+    ],
+)
+def test_a_users_mistake_is_one_line(recorded, tmp_path, monkeypatch, capsys, arguments, parts):
+    monkeypatch.chdir(tmp_path)
+    filled = [a.format(model=recorded[0], data=recorded[1][0]) for a in arguments]
+    assert cli.main(filled) == 2
+    assert parts in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists() or not list((tmp_path / "runs").iterdir())
+
+
+def test_a_run_of_another_kind_is_no_grounded_model(recorded, tmp_path, capsys):
+    RunDirectory.create(tmp_path / "run", {}, "garat transfer", [0])
+    command = ["compare", str(recorded[0]), str(recorded[1][0]), "--grounded"]
+    assert cli.main([*command, str(tmp_path / "run")]) == 2
+    assert "holds no action transformer; expected a run of garat ground" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", presets.GROUNDING)
+def test_hidden_friction_is_learned_in_part(method, tmp_path):
+    path = tmp_path / "pendulum.xml"
+    path.write_text(models.PENDULUM)
+    made = make_recordings(path, tmp_path / "data", 0, kind="coulomb_friction")
+    model = load_model(path)
+    fit, holdout = (read_recordings(model, files) for files in (made.fit, made.holdout))
+    run = RunDirectory.create(tmp_path / "run", {}, "test", [0])
+    done = ground(model, fit, presets.GROUNDING[method], run, holdout=holdout)
+    assert done.comparison.also[0].error < 0.9 * done.comparison.error.before
