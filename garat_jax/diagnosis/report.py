@@ -21,8 +21,8 @@ from garat_jax.diagnosis.report_data import (
     side_by_side_section,
     torque_section,
 )
-from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Estimate
-from garat_jax.diagnosis.view import View, look
+from garat_jax.diagnosis.results import OFFER, Candidate, Diagnosis, Errors, Estimate
+from garat_jax.diagnosis.view import View, leftover, look
 from garat_jax.report import Fact, Figure, Reproduce, Section, Table
 from garat_jax.runs import RunDirectory
 
@@ -116,6 +116,7 @@ def diagnosis_sections(
         *_parameters(diagnosis, model),
         *repeatability_section(diagnosis.repeatability),
         *_next(diagnosis),
+        *_left(diagnosis, view),
     ]
 
 
@@ -362,6 +363,14 @@ def _next(diagnosis: Diagnosis) -> list[Section]:
     names = " and ".join(f"{words(n.effect)} at {n.target}" for n in experiment.separates)
     text = f"These recordings cannot tell {names} apart.\n\n{experiment.how}"
     return [Section("What to record next", text)]
+
+
+def _left(diagnosis: Diagnosis, view: View) -> list[Section]:
+    if diagnosis.verdict != "unexplained":
+        return []
+    evidence = "\n".join(f"- {place.evidence}" for place in leftover(view)[:3])
+    text = evidence or "The torque that is still missing follows no simple pattern."
+    return [Section("What is left", f"{text}\n\n{OFFER[0].upper()}{OFFER[1:]}")]
 
 
 def _estimate(name: str, e: Estimate) -> str:

@@ -12,6 +12,11 @@ from garat_jax.errors import choose
 from garat_jax.runs import finite_or_null, to_plain
 
 FORMAT = "garat-diagnosis/1"
+OFFER = (
+    "what no effect explains, an action transformer may learn from the recordings: garat ground "
+    "MODEL DATA... --method gat, or garat; garat compare --grounded then says how much that is."
+)
+"""What is said where the verdict is `unexplained`."""
 Verdict = Literal["adequate", "missing_effect", "unexplained"]
 
 
@@ -227,4 +232,6 @@ class Diagnosis:
             lines.append(f"  {added}: fit {rung.error_fit:.4g}, held-out {rung.error_holdout:.4g}")
         if self.next_experiment:
             lines.append(f"  next: {self.next_experiment.how}")
+        if self.verdict == "unexplained":
+            lines.append(f"  or: {OFFER}")
         return "\n".join(lines)

@@ -4,9 +4,10 @@ import dataclasses
 from collections.abc import Sequence
 
 import mujoco
+import numpy as np
 
 from garat_jax.diagnosis.diagnose import thin
-from garat_jax.diagnosis.localise import MissingTorque, missing_torque
+from garat_jax.diagnosis.localise import MissingTorque, Place, localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
@@ -53,6 +54,24 @@ def repaired(model: Model, selected: Sequence[Candidate]) -> Model:
         for c in selected
     )
     return dataclasses.replace(model, effects=(*model.effects, *effects))
+
+
+def leftover(view: View) -> list[Place]:
+    """Say what the torque that is still missing after the repair goes with, largest share first.
+
+    It is the torque that the measured motion lacks less the one that the repaired model's own
+    predictions lack by the same computation, on the same segments.
+    """
+    if view.explained is None:
+        return localise(view.missing)
+    played = view.after[-1]
+    predicted = as_recordings(played, view.recordings, view.host)
+    measured = [
+        dataclasses.replace(view.recordings[i], spans=made.spans)
+        for i, made in zip(np.unique(played.segments.recording), predicted, strict=True)
+    ]
+    missing = missing_torque(view.host, measured)
+    return localise(missing._replace(torque=missing.torque - view.explained.torque))
 
 
 def look(model: Model, recordings: Sequence[Recording], selected: Sequence[Candidate] = ()) -> View:

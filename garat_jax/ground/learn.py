@@ -57,11 +57,11 @@ class Grounded:
     def sentence(self) -> str:
         """What grounding did to the held-out error, in one sentence."""
         before, after = self.comparison.error.before, self.comparison.also[0].error
-        verb = "falls" if after < before else "rises, so the transformer is of no use,"
+        verb, use = ("falls", "") if after < before else ("rises", " The model is better without.")
         return (
             f"With the action transformer the held-out error {verb} from {100 * before:.3g} % to "
             f"{100 * after:.3g} % of the signals' spread; noise alone makes "
-            f"{100 * self.comparison.error.noise_floor:.2g} %."
+            f"{100 * self.comparison.error.noise_floor:.2g} %.{use}"
         )
 
 

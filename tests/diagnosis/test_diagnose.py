@@ -59,6 +59,7 @@ def test_an_effect_outside_the_catalogue_is_unexplained_and_the_result_is_plain(
     assert content["format"] == "garat-diagnosis/1"
     assert "NaN" not in json.dumps(content, allow_nan=False)
     assert "unexplained" in str(found)
+    assert "garat ground MODEL DATA... --method gat" in str(found)
 
 
 @pytest.mark.slow

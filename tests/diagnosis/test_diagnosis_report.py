@@ -18,7 +18,7 @@ from garat_jax.diagnosis.results import (
     Named,
     Rung,
 )
-from garat_jax.diagnosis.view import repaired
+from garat_jax.diagnosis.view import leftover, look, repaired
 from garat_jax.runs import RunDirectory
 from tests import models
 
@@ -129,6 +129,13 @@ def test_page_of_an_adequate_model_promises_no_repair(tmp_path):
     assert "repaired" not in page
 
 
+def test_page_of_an_unexplained_gap_says_what_is_left_and_offers_to_learn_it(tmp_path):
+    page = write(tmp_path, dataclasses.replace(MISSING, verdict="unexplained", selected=()))
+    left = page.partition("<h2>What is left</h2>")[2]
+    assert "of the missing torque is at hinge, against or with the motion" in left
+    assert "garat ground MODEL DATA... --method gat" in left
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -145,6 +152,21 @@ def test_page_of_an_adequate_model_promises_no_repair(tmp_path):
 )
 def test_lead_says_the_verdict(changes, said):
     assert said in diagnosis_lead(dataclasses.replace(MISSING, **changes))
+
+
+def test_what_a_repair_explains_is_not_left(tmp_path):
+    path = tmp_path / "pendulum.xml"
+    path.write_text(models.PENDULUM)
+    made = make_recordings(path, tmp_path / "data", 0, 2, seconds=4.0, kind="coulomb_friction")
+    model = load_model(path)
+    recordings = [Recording.read(file, model) for file in (*made.fit, *made.holdout)]
+    size = Estimate(made.parameters["torque"], 0.0, 1.0, "N m")
+    found = dataclasses.replace(FRICTION, parameters={"torque": size})
+    before, after = (leftover(look(model, recordings, chosen)) for chosen in ((), (found,)))
+    shares = [{p.regime: p.share for p in places} for places in (before, after)]
+    friction = "against or with the motion"
+    assert shares[0][friction] > 0.5
+    assert shares[1].get(friction, 0.0) < 0.3 * shares[0][friction]
 
 
 def test_repair_adds_the_effects_with_their_estimates(tmp_path):
