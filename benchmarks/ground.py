@@ -8,7 +8,6 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,31 +50,22 @@ BREAKAWAY = 0.02
 """rad/s below which the tight spot's friction gives way smoothly."""
 
 
-def no_force(angle: float, speed: float) -> float:
-    return 0.0
-
-
 def tight_spot(angle: float, speed: float) -> float:
     """Return the torque of a bearing that is tight around one angle [N m]."""
     return -TIGHT * np.exp(-(((angle - AT) / WIDTH) ** 2)) * np.tanh(speed / BREAKAWAY)
 
 
-SIMULATED: dict[str, tuple[float, Callable[[float, float], float]]] = {
-    "nothing missing": (0.0, no_force),
-    "dry friction": (FRICTION, no_force),
-    "dry friction and a tight spot": (FRICTION, tight_spot),
-}
-"""Dry friction, and the force that the catalogue does not have."""
-REAL = "motor pendulum"
+SIMULATED, REAL = "dry friction and a tight spot", "motor pendulum"
+"""The cases."""
 
 
-def record(out: Path, friction: float, force: Callable[[float, float], float]) -> Converted:
+def record(out: Path) -> Converted:
     """Write recordings of the machine, by C MuJoCo alone at a finer timestep."""
     out.mkdir(parents=True, exist_ok=True)
     path = out / "pendulum.xml"
     path.write_text(MJCF)
     spec = mujoco.MjSpec.from_string(MJCF)
-    spec.joints[0].frictionloss = friction
+    spec.joints[0].frictionloss = FRICTION
     spec.option.timestep = finer_timestep(spec.option.timestep, 1 / RATE)
     model = spec.compile()
     substeps = round(1 / RATE / model.opt.timestep)
@@ -83,7 +73,7 @@ def record(out: Path, friction: float, force: Callable[[float, float], float]) -
     rng = np.random.default_rng(0)
 
     def act(data: mujoco.MjData) -> None:
-        data.qfrc_applied[0] = force(data.qpos[0], data.qvel[0])
+        data.qfrc_applied[0] = tight_spot(data.qpos[0], data.qvel[0])
 
     files = []
     for index in range(NUM_RECORDINGS):
@@ -140,7 +130,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/ground"))
     parser.add_argument("--measurements", type=Path, help="folder of the motor pendulum's runs")
-    parser.add_argument("--only", nargs="+", choices=[*SIMULATED, REAL], default=[*SIMULATED, REAL])
+    parser.add_argument("--only", nargs="+", choices=[SIMULATED, REAL], default=[SIMULATED, REAL])
     arguments = parser.parse_args()
     rows = []
     for name in arguments.only:
@@ -154,12 +144,12 @@ def main() -> None:
                     arguments.measurements, out / "data", ["ddp", "sac"], ["energy_shaping"]
                 )
             else:
-                made = record(out / "data", *SIMULATED[name])
+                made = record(out / "data")
             row = run_case(name, made, out, shlex.join(["python", *sys.argv]))
             done.write_text(json.dumps(row, indent=2))
         rows.append(json.loads(done.read_text()))
         sys.stdout.write(f"{json.dumps(rows[-1], indent=2)}\n")
-    if arguments.only == [*SIMULATED, REAL]:
+    if arguments.only == [SIMULATED, REAL]:
         command = "python benchmarks/ground.py --measurements FOLDER"
         write_result("ground", rows, seeds=[0], command=command)
 

@@ -157,12 +157,28 @@ def real_data() -> str:
     return table(columns, rows) + origin("real_data", result)
 
 
+def ground() -> str:
+    result = read("ground")
+    rows = [
+        (
+            f"{row['case']}: {label}",
+            *(f"{100 * errors[label]:.2f}" if label in errors else "–" for errors in by_horizon),
+        )
+        for row in result["rows"]
+        for by_horizon in [[row["horizons"].get(h, {}) for h in ("0.2", "0.5", "1.0", "2.0")]]
+        for label in row["errors"]
+    ]
+    columns = ("held-out error, % of the signals' spread", "0.2 s", "0.5 s", "1 s", "2 s")
+    return table(columns, rows) + origin("ground", result)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "transfer": transfer,
     "variants": variants,
     "throughput": throughput,
     "flags": flags,
     "real_data": real_data,
+    "ground": ground,
 }
 
 
