@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Protocol
 
 from tyro.conf import Positional, arg
 
-from garat_jax import __version__
+from garat_jax import __version__, compilation_cache
 from garat_jax.commandline import PROGRAM, how_to_go_on, parse
 from garat_jax.commands.console import complain, make_run, print_table, say
 from garat_jax.commands.diagnosis import Compare, Diagnose, Ground, Improve, Plan
@@ -143,6 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else is a fault of the program and leaves as an exception.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    compilation_cache.enable()
     try:
         if arguments == ["--version"]:
             say(f"{PROGRAM} {__version__}")

@@ -1,8 +1,10 @@
 """C MuJoCo within compiled programs: a callback that steps a whole batch on threads."""
 
+import contextlib
 import functools
 import hashlib
 import threading
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +12,18 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from garat_jax import host_call
 from garat_jax.errors import UserError
 from garat_jax.setconst import CONSTANT_INPUTS
 
 STATE_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")
-KEPT_BATCHES = 8
-"""Batches of simulations that are kept for the next call."""
+KEPT_BATCHES = 16
+"""Batches of simulations, of all models together, that are kept for the next call."""
 INPUTS = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
+
+_idle: list[tuple[tuple, Batch]] = []
+"""Simulations that no call uses now, those used last at the end; scratch space without a state."""
+_idle_lock = threading.Lock()
 
 
 class HostModel:
@@ -32,8 +39,7 @@ class HostModel:
         self.model = model
         buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, buffer)
-        self._digest = hashlib.sha256(buffer.tobytes()).digest()
-        self._lock = threading.Lock()
+        self._digest = hashlib.sha256(buffer.tobytes()).hexdigest()
 
     def __hash__(self) -> int:
         return hash(self._digest)
@@ -58,7 +64,8 @@ class HostModel:
             num_substeps: Physics substeps.
         """
         function = functools.partial(self._advance_batch, num_substeps)
-        result = self._call(function, (sum(self.sizes),), fields, state, commands, forces)
+        name = f"advance {num_substeps}"
+        result = self._call(name, function, (sum(self.sizes),), fields, state, commands, forces)
         time, *parts = jnp.split(result, np.cumsum(self.sizes)[:-1])
         return type(state)(time[0], *parts, memory=state.memory)
 
@@ -79,9 +86,10 @@ class HostModel:
         repeat = num_steps * num_substeps // commands.shape[0]
         shape = (num_steps, self.model.nq + self.model.nv)
         function = functools.partial(self._trace_batch, num_substeps, repeat)
-        return self._call(function, shape, fields, state, commands, forces)
+        name = f"trace {num_substeps} {repeat}"
+        return self._call(name, function, shape, fields, state, commands, forces)
 
-    def _call(self, function, shape: tuple[int, ...], fields, state, commands, forces):
+    def _call(self, name: str, function, shape: tuple[int, ...], fields, state, commands, forces):
         """Call back with a batch of simulations, everything as 32-bit words."""
         if self.model.nhistory or self.model.nplugin:
             raise UserError("engine mujoco does not carry plugins or native delays; use mjx")
@@ -90,17 +98,20 @@ class HostModel:
         )
         control = jnp.concatenate([commands, forces], axis=1)
         inputs = {"row": row, "control": control, **fields}
-        words = row.dtype.itemsize // 4
-        result = jax.pure_callback(
-            functools.partial(self._on_host, function, str(row.dtype)),
-            jax.ShapeDtypeStruct((int(np.prod(shape)) * words,), jnp.uint32),
-            {name: _to_words(value.astype(row.dtype)) for name, value in inputs.items()},
-            vmap_method="expand_dims",
+        dtype = str(row.dtype)
+        result = host_call.call(
+            " ".join((self._digest, name, dtype, *inputs)),
+            functools.partial(self._on_host, function, dtype, tuple(inputs)),
+            int(np.prod(shape)) * (row.dtype.itemsize // 4),
+            [_to_words(value.astype(row.dtype)) for value in inputs.values()],
         )
         return _from_words(result, row.dtype).reshape(shape)
 
-    def _on_host(self, function, dtype: str, words) -> np.ndarray:
-        fields = {name: np.ascontiguousarray(value).view(dtype) for name, value in words.items()}
+    def _on_host(self, function, dtype: str, names: tuple[str, ...], words) -> np.ndarray:
+        fields = {
+            name: np.ascontiguousarray(value).view(dtype)
+            for name, value in zip(names, words, strict=True)
+        }
         row, control = fields.pop("row"), fields.pop("control")
         control = control.reshape(*control.shape[:-1], -1, self.model.nu + self.model.nv)
         shapes = {name: _field_shape(self.model, name) for name in fields}
@@ -111,8 +122,7 @@ class HostModel:
             *(value.shape[: value.ndim - len(shapes[name])] for name, value in fields.items()),
         )
         num = int(np.prod(leading, dtype=int))
-        with self._lock:
-            batch = self._batch(num, frozenset(fields))
+        with self._batch(num, frozenset(fields)) as batch:
             _write_fields(batch, fields, shapes, leading)
             rows = np.broadcast_to(row, leading + row.shape[-1:]).reshape(num, -1)
             _write_state(batch, rows)
@@ -155,23 +165,20 @@ class HostModel:
         path[~(time > end)] = np.nan
         return path
 
-    @functools.cached_property
-    def _batches(self) -> dict:
-        return {}
-
-    def _batch(self, num: int, fields: frozenset[str]) -> Batch:
-        """Return the simulations for a batch size; each set of changed fields has its own.
-
-        The ones used last are kept.
-        """
-        batch = self._batches.pop((num, fields), None)
+    @contextlib.contextmanager
+    def _batch(self, num: int, fields: frozenset[str]) -> Iterator[Batch]:
+        """Lend simulations for a batch size; each set of changed fields has its own."""
+        key = (self._digest, num, fields)
+        with _idle_lock:
+            found = [index for index, (kept, _) in enumerate(_idle) if kept == key]
+            batch = _idle.pop(found[-1])[1] if found else None
         if batch is None:
             batch = Batch(self.model, num)
             batch.bind("sensordata")
-        self._batches[num, fields] = batch
-        while len(self._batches) > KEPT_BATCHES:
-            del self._batches[next(iter(self._batches))]
-        return batch
+        yield batch
+        with _idle_lock:
+            _idle.append((key, batch))
+            del _idle[:-KEPT_BATCHES]
 
 
 def _to_words(values: jax.Array) -> jax.Array:

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from garat_jax import compilation_cache
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 # Before the first import of JAX, and inherited by the processes that tests start.
-_CACHE_HOME = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE_HOME / "garat_jax" / "jax"))
-Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).mkdir(parents=True, exist_ok=True)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+compilation_cache.enable()
 
 
 @pytest.fixture(scope="session")
