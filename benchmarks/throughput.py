@@ -21,10 +21,10 @@ from garat_jax import rollout
 from garat_jax.agents import ppo, trpo
 from garat_jax.agents.ppo import PPOConfig
 from garat_jax.agents.trpo import TRPOConfig
+from garat_jax.compiler_options import compiler_options
 from garat_jax.env import Env, World, make_world
 from garat_jax.envs import ENVS
 from garat_jax.errors import choose
-from garat_jax.train import compiler_options
 from garat_jax.types import Agent
 
 

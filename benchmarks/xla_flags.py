@@ -18,11 +18,11 @@ import tyro
 from record import write_result
 
 from garat_jax import dynamics
+from garat_jax.compiler_options import FUSION_EMITTERS, chain_depth
 from garat_jax.dynamics import Dynamics
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.errors import UserError
 from garat_jax.overrides import load_spec
-from garat_jax.train import FUSION_EMITTERS, chain_depth
 
 ARM = """
 <mujoco model="arm of six joints">

@@ -17,6 +17,7 @@ from garat_jax import __version__, compilation_cache
 from garat_jax.commandline import PROGRAM, how_to_go_on, parse
 from garat_jax.commands.console import complain, make_run, print_table, say
 from garat_jax.commands.diagnosis import Compare, Diagnose, Ground, Improve, Plan
+from garat_jax.commands.machine import Device, Doctor
 from garat_jax.commands.models import Add, Convert, Effects, Export
 from garat_jax.errors import DivergedError, UserError, choose
 
@@ -76,6 +77,8 @@ class Transfer:
     """How many seeds: 0, 1, ..."""
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
     """Physics: MJX, C MuJoCo, or the faster of the two on this machine."""
+    device: Device = "auto"
+    """What computes."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder for the results; runs/PAIR-METHOD by default."""
     force: bool = False
@@ -87,11 +90,13 @@ class Transfer:
         """Run the transfer experiment."""
         if self.seeds < 1:
             raise UserError(f"--seeds {self.seeds}: expected 1 or more")
+        from garat_jax.devices import use
         from garat_jax.envs.pairs import PAIRS
         from garat_jax.presets import METHODS
         from garat_jax.summary import describe
         from garat_jax.transfer import run_transfer
 
+        use(self.device)
         config = choose("method", self.method, METHODS)(
             choose("pair", self.pair, PAIRS), seeds=self.seeds, engine=self.engine
         )
@@ -129,6 +134,7 @@ COMMANDS: dict[str, type[Command]] = {
     "plan": Plan,
     "effects": Effects,
     "list": List,
+    "doctor": Doctor,
 }
 
 
@@ -155,6 +161,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return complain(f"error: {error}", FAILED)
     except UserError as error:
         return complain(f"error: {error}", USER_ERROR)
+    except RuntimeError as error:  # a device that is not there shows wherever JAX starts
+        from garat_jax.devices import NOT_THERE, describe
+
+        if not str(error).startswith(NOT_THERE):
+            raise
+        return complain(f"error: {describe(error)}", USER_ERROR)
     return DONE
 
 

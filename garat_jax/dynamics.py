@@ -101,9 +101,16 @@ def compile(
         host = HostModel(spec.compile())
     except ValueError as error:
         raise UserError(f"MuJoCo cannot compile the model: {error}") from error
-    model = mjx.put_model(host.model) if engine == "mjx" else None
+    model = _put_model(host.model) if engine == "mjx" else None
     as_arrays = jax.tree.map(jnp.asarray, tuple(effects))
     return Dynamics(effects=as_arrays, model=model, host=host, engine=engine)
+
+
+def _put_model(model: mujoco.MjModel) -> mjx.Model:
+    try:
+        return mjx.put_model(model)
+    except NotImplementedError as error:
+        raise UserError(f"engine mjx cannot step this model: {error}; use mujoco") from error
 
 
 def view(dynamics: Dynamics) -> ModelView:

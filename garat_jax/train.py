@@ -1,8 +1,6 @@
 """The one host loop: compile, step, evaluate, log, checkpoint, resume, and stop on NaN."""
 
 import dataclasses
-import functools
-import os
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -13,7 +11,6 @@ import numpy as np
 from rich.console import Console
 
 from garat_jax import checkpoint
-from garat_jax.dynamics import Dynamics
 from garat_jax.errors import DivergedError
 from garat_jax.interrupt import deferred_interrupt
 from garat_jax.rollout import Fault
@@ -26,10 +23,6 @@ REPORT_SECONDS = 5.0
 LARGEST_FAULTY_SHARE = 0.01
 """Share of a batch's steps in which physics may leave the finite numbers before training stops."""
 FAULTY = "faulty_share"
-DEEP_CHAIN = 5
-"""Joints in a chain from which XLA's CPU fusion emitters slow MJX down; see docs/performance.md."""
-FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
-
 
 SECONDS = "seconds.json"
 
@@ -272,36 +265,3 @@ def until_solved(step, evaluate, solved_return: float):
         return UntilSolved(state, solved, key), metrics
 
     return stepped
-
-
-def compiler_options(dynamics: Dynamics) -> dict[str, Any]:
-    """Return XLA's options for programs that step these dynamics.
-
-    XLA's CPU fusion emitters make MJX up to hundreds of times slower on deep kinematic chains
-    (github.com/jax-ml/jax/issues/33761) and shallow ones slightly faster. C MuJoCo is not touched
-    by them. What the user put in XLA_FLAGS stays as it is.
-    """
-    if dynamics.engine != "mjx" or jax.default_backend() != "cpu":
-        return {}
-    if chain_depth(dynamics) < DEEP_CHAIN or FUSION_EMITTERS in os.environ.get("XLA_FLAGS", ""):
-        return {}
-    return {FUSION_EMITTERS: False} if is_known_option(FUSION_EMITTERS) else {}
-
-
-@functools.cache
-def is_known_option(name: str) -> bool:
-    """Say whether the installed XLA takes a compiler option; it refuses those it does not know."""
-    try:
-        jax.jit(lambda x: x + 1, compiler_options={name: False}).lower(0.0).compile()
-    except jax.errors.JaxRuntimeError:
-        return False
-    return True
-
-
-def chain_depth(dynamics: Dynamics) -> int:
-    """Return the largest number of degrees of freedom between the world and a body."""
-    host = dynamics.host.model
-    depth = np.zeros(host.nbody, int)
-    for body in range(1, host.nbody):
-        depth[body] = depth[host.body_parentid[body]] + host.body_dofnum[body]
-    return int(depth.max())

@@ -17,6 +17,7 @@ from garat_jax import rollout, summary, train
 from garat_jax.agents import trpo
 from garat_jax.agents.actor_critic import ActorCriticState, PolicyParams
 from garat_jax.agents.trpo import TRPOConfig
+from garat_jax.compiler_options import compiler_options
 from garat_jax.dynamics import Override
 from garat_jax.effects import Effect
 from garat_jax.env import Env, Task, World, make_world
@@ -156,12 +157,12 @@ class Experiment:
             state,
             params,
             num_iterations,
-            train.compiler_options(world.params),
+            compiler_options(world.params),
         )
 
     def map(self, function, *arguments, axes: Any = 0) -> Any:
         """Apply a function to the arguments of every seed; `axes` as `vmap`'s."""
-        options = train.compiler_options(self.worlds.source.params)
+        options = compiler_options(self.worlds.source.params)
         return self.trainer.call(jax.vmap(function, in_axes=axes), *arguments, options=options)
 
     def target_returns(self, policy: PolicyParams, stage: str) -> np.ndarray:

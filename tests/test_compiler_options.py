@@ -3,7 +3,7 @@
 import mujoco
 import pytest
 
-from garat_jax import dynamics, train
+from garat_jax import compiler_options, dynamics
 
 JOINT = "<body pos='0 0 .1'><joint axis='0 1 0'/><geom size='.02' mass='.1'/>"
 
@@ -20,18 +20,20 @@ def no_flags(monkeypatch):
 
 
 def test_only_deep_chains_in_mjx_are_compiled_without_fusion_emitters():
-    assert train.compiler_options(make_chain(6)) == {train.FUSION_EMITTERS: False}
-    assert train.compiler_options(make_chain(2)) == {}
-    assert train.compiler_options(make_chain(6, engine="mujoco")) == {}
+    assert compiler_options.compiler_options(make_chain(6)) == {
+        compiler_options.FUSION_EMITTERS: False
+    }
+    assert compiler_options.compiler_options(make_chain(2)) == {}
+    assert compiler_options.compiler_options(make_chain(6, engine="mujoco")) == {}
 
 
 def test_the_users_own_flag_is_left_alone(monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", f"--{train.FUSION_EMITTERS}=true")
-    assert train.compiler_options(make_chain(6)) == {}
+    monkeypatch.setenv("XLA_FLAGS", f"--{compiler_options.FUSION_EMITTERS}=true")
+    assert compiler_options.compiler_options(make_chain(6)) == {}
 
 
 def test_an_option_that_xla_does_not_know_is_not_used(monkeypatch):
-    assert train.is_known_option(train.FUSION_EMITTERS)
-    assert not train.is_known_option("xla_cpu_option_that_is_gone")
-    monkeypatch.setattr(train, "FUSION_EMITTERS", "xla_cpu_option_that_is_gone")
-    assert train.compiler_options(make_chain(6)) == {}
+    assert compiler_options.is_known_option(compiler_options.FUSION_EMITTERS)
+    assert not compiler_options.is_known_option("xla_cpu_option_that_is_gone")
+    monkeypatch.setattr(compiler_options, "FUSION_EMITTERS", "xla_cpu_option_that_is_gone")
+    assert compiler_options.compiler_options(make_chain(6)) == {}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from garat_jax import checkpoint, dynamics, train
+from garat_jax import checkpoint, compiler_options, dynamics, train
 from garat_jax.agents import ppo
 from garat_jax.dynamics import Override
 from garat_jax.env import make_world
@@ -257,22 +257,22 @@ def world(depth: int, engine: str):
 def test_compiler_options_are_for_deep_chains_in_mjx_on_a_cpu(monkeypatch):
     flag = {"xla_cpu_use_fusion_emitters": False}
     deep, shallow = world(6, "mjx"), world(2, "mjx")
-    assert (train.chain_depth(deep), train.chain_depth(shallow)) == (6, 2)
+    assert (compiler_options.chain_depth(deep), compiler_options.chain_depth(shallow)) == (6, 2)
     on_cpu = flag if jax.default_backend() == "cpu" else {}
-    assert train.compiler_options(deep) == on_cpu
-    assert train.compiler_options(shallow) == {}
-    assert train.compiler_options(world(6, "mujoco")) == {}
+    assert compiler_options.compiler_options(deep) == on_cpu
+    assert compiler_options.compiler_options(shallow) == {}
+    assert compiler_options.compiler_options(world(6, "mujoco")) == {}
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert train.compiler_options(deep) == {}
+    assert compiler_options.compiler_options(deep) == {}
 
 
 def test_the_compiler_takes_its_options_or_the_run_stops_here(tmp_path):
     loop = trainer(directory(tmp_path / "run"))
-    options = train.compiler_options(world(6, "mjx"))
+    options = compiler_options.compiler_options(world(6, "mjx"))
     assert loop.call(lambda x: x + 1, jnp.ones(3), options=options).sum() == 6
 
 
 def test_chain_depth_counts_dofs_of_the_longest_branch():
     pair = CHAIN.format(LINK.format("") + LINK.format(LINK.format("")))
-    assert train.chain_depth(dynamics.compile(spec(pair), engine="mujoco")) == 2
-    assert train.chain_depth(dynamics.compile(spec(PENDULUM), engine="mujoco")) == 1
+    assert compiler_options.chain_depth(dynamics.compile(spec(pair), engine="mujoco")) == 2
+    assert compiler_options.chain_depth(dynamics.compile(spec(PENDULUM), engine="mujoco")) == 1

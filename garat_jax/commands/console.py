@@ -67,7 +67,7 @@ def make_run(
         complain(f"warning: the run was begun with other versions: {', '.join(changed)}", 0)
     try:
         yield run
-    except UserError:
+    except (UserError, RuntimeError):
         run.discard()
         raise
 

@@ -1,0 +1,47 @@
+"""XLA's compiler options for programs that step a model."""
+
+import functools
+import os
+from typing import Any
+
+import jax
+import numpy as np
+
+from garat_jax.dynamics import Dynamics
+
+DEEP_CHAIN = 5
+"""Joints in a chain from which XLA's CPU fusion emitters slow MJX down; see docs/performance.md."""
+FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
+
+
+def compiler_options(dynamics: Dynamics) -> dict[str, Any]:
+    """Return XLA's options for programs that step these dynamics.
+
+    XLA's CPU fusion emitters make MJX up to hundreds of times slower on deep kinematic chains
+    (github.com/jax-ml/jax/issues/33761) and shallow ones slightly faster. C MuJoCo is not touched
+    by them. What the user put in XLA_FLAGS stays as it is.
+    """
+    if dynamics.engine != "mjx" or jax.default_backend() != "cpu":
+        return {}
+    if chain_depth(dynamics) < DEEP_CHAIN or FUSION_EMITTERS in os.environ.get("XLA_FLAGS", ""):
+        return {}
+    return {FUSION_EMITTERS: False} if is_known_option(FUSION_EMITTERS) else {}
+
+
+@functools.cache
+def is_known_option(name: str) -> bool:
+    """Say whether the installed XLA takes a compiler option; it refuses those it does not know."""
+    try:
+        jax.jit(lambda x: x + 1, compiler_options={name: False}).lower(0.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+def chain_depth(dynamics: Dynamics) -> int:
+    """Return the largest number of degrees of freedom between the world and a body."""
+    host = dynamics.host.model
+    depth = np.zeros(host.nbody, int)
+    for body in range(1, host.nbody):
+        depth[body] = depth[host.body_parentid[body]] + host.body_dofnum[body]
+    return int(depth.max())

@@ -1,0 +1,162 @@
+"""What this machine offers, a short measurement, and what follows from both."""
+
+import dataclasses
+import itertools
+import os
+import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+
+from garat_jax import compilation_cache, dynamics, provenance
+from garat_jax.compiler_options import FUSION_EMITTERS, is_known_option
+from garat_jax.devices import use
+from garat_jax.dynamics import PhysicsState
+from garat_jax.overrides import load_spec
+
+PENDULUM = Path(__file__).parent / "envs" / "assets" / "pendulum.xml"
+SECONDS = 1.25
+"""Of each of the four measurements: 5 s in all."""
+BATCH = 64
+NUM_STEPS = 100
+"""In one call of a program."""
+ENGINES = ("mujoco", "mjx")
+
+
+@dataclasses.dataclass(frozen=True)
+class Rate:
+    """Physics steps a second of the pendulum, of all simulations together."""
+
+    engine: str
+    batch: int
+    steps_per_second: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Examination:
+    """What was found.
+
+    Attributes:
+        facts: What it is and what it was found to be.
+        rates: The measurement: each engine, one simulation and a batch.
+        advice: What follows, one sentence each.
+    """
+
+    facts: list[tuple[str, str]]
+    rates: list[Rate]
+    advice: list[str]
+
+
+def examine(device: str, seconds: float = SECONDS) -> Examination:
+    """Look at the machine and measure both engines.
+
+    Args:
+        device: As for `devices.use`.
+        seconds: Of each of the four measurements.
+
+    Raises:
+        UserError: There is no such device.
+    """
+    devices = use(device)
+    cases = list(itertools.product(ENGINES, (1, BATCH)))
+    with Console(stderr=True).status("compiling and measuring"):
+        prepared = [prepare(engine, batch) for engine, batch in cases]
+        with ThreadPoolExecutor() as pool:
+            programs = list(pool.map(lambda case: case[0].compile(), prepared))
+        rates = [
+            Rate(*case, measure(program, start, case[1], seconds))
+            for case, program, (_, start) in zip(cases, programs, prepared, strict=True)
+        ]
+    return Examination(facts(devices), rates, advise(rates, devices[0].platform))
+
+
+def facts(devices: list[Any]) -> list[tuple[str, str]]:
+    """Return what the machine, the versions, the devices and the settings are."""
+    machine, versions = provenance.machine(), provenance.versions()
+    kinds = [device.device_kind for device in devices]
+    names = ", ".join(f"{kinds.count(kind)} x {kind}" for kind in dict.fromkeys(kinds))
+    platform = devices[0].platform
+    auto = "C MuJoCo (mujoco)" if platform == "cpu" else "MJX (mjx)"
+    known = "taken" if is_known_option(FUSION_EMITTERS) else "not known, left out"
+    folder = compilation_cache.folder()
+    return [
+        ("machine", f"{machine['system']}, {machine['cores']} cores, {machine['memory_gib']} GiB"),
+        ("processor", str(machine["cpu"])),
+        ("devices", f"{platform}: {names}"),
+        ("engines", f"mujoco, mjx; auto takes {auto}"),
+        ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
+        ("XLA_FLAGS", os.environ.get("XLA_FLAGS") or "not set"),
+        ("option for deep chains", f"{FUSION_EMITTERS}=false: {known}"),
+        ("compiled programs", _held(folder) if folder else "not kept"),
+    ]
+
+
+def _held(folder: Path) -> str:
+    sizes = [path.stat().st_size for path in folder.glob("*-cache")]
+    return f"{len(sizes)} in {folder}, {sum(sizes) / 2**20:.0f} MiB"
+
+
+def prepare(engine: str, batch: int) -> tuple[jax.stages.Lowered, PhysicsState]:
+    """Return a program, not compiled yet, that swings a batch of pendulums, and its start."""
+    world = dynamics.compile(load_spec(PENDULUM), engine=engine)
+
+    def begin(angle: jax.Array) -> PhysicsState:
+        return dynamics.initial_state(world, angle[None], jnp.zeros(1))
+
+    def run(state: PhysicsState) -> PhysicsState:
+        def step(state: PhysicsState, _):
+            return jax.vmap(lambda s: dynamics.step(world, s, jnp.zeros(1)))(state), None
+
+        return jax.lax.scan(step, state, length=NUM_STEPS)[0]
+
+    start = jax.vmap(begin)(jnp.linspace(0.1, 1.0, batch))
+    return jax.jit(run).lower(start), start
+
+
+def measure(program: jax.stages.Compiled, state: PhysicsState, batch: int, seconds: float) -> float:
+    """Return the physics steps a second of a compiled program and its batch."""
+    state, rounds = jax.block_until_ready(program(state)), 0
+    started = time.perf_counter()
+    while time.perf_counter() - started < seconds:
+        state, rounds = jax.block_until_ready(program(state)), rounds + 1
+    return rounds * NUM_STEPS * batch / (time.perf_counter() - started)
+
+
+def advise(rates: list[Rate], platform: str) -> list[str]:
+    """Return what follows from the rates and from what is set."""
+    rate = {(r.engine, r.batch): r.steps_per_second for r in rates}
+    auto = "mujoco" if platform == "cpu" else "mjx"
+    best = max(ENGINES, key=lambda engine: rate[engine, BATCH])
+    other = next(engine for engine in ENGINES if engine != best)
+    factor = rate[best, BATCH] / rate[other, BATCH]
+    advice = []
+    if best == auto:
+        advice.append(f"Leave --engine at auto: {best} is {factor:.1f} times as fast here.")
+    else:
+        advice.append(
+            f"On this pendulum {best} is {factor:.1f} times as fast as {auto}, which auto takes; "
+            f"models with contacts differ, so time yours with --engine {best} as well."
+        )
+    gain = rate[best, BATCH] / rate[best, 1]
+    advice.append(
+        f"{BATCH} simulations at once do {gain:.0f} times the steps of one: "
+        "run seeds together (--seeds) and give a fit several recordings."
+    )
+    if platform == "cpu" and shutil.which("nvidia-smi"):
+        advice.append("JAX does not use the NVIDIA GPU: pip install 'garat_jax[cuda]'.")
+    if compilation_cache.folder() is None:
+        advice.append(
+            "Compiled programs are not kept, so every start compiles: unset "
+            f"{compilation_cache.SWITCH}, or name a folder in {compilation_cache.FOLDER}."
+        )
+    if FUSION_EMITTERS in os.environ.get("XLA_FLAGS", ""):
+        advice.append(
+            f"XLA_FLAGS sets {FUSION_EMITTERS} for every model; without it, it is off for deep "
+            "chains alone, where it makes MJX slow."
+        )
+    return advice

@@ -1,0 +1,71 @@
+"""What `garat doctor` finds, measures and advises."""
+
+import jax
+import pytest
+
+from garat_jax import cli, doctor
+from garat_jax.doctor import BATCH, Rate
+from garat_jax.errors import UserError
+
+
+def rates(mujoco: float, mjx: float) -> list[Rate]:
+    return [
+        Rate(engine, batch, rate * (1 if batch == 1 else 10))
+        for engine, rate in (("mujoco", mujoco), ("mjx", mjx))
+        for batch in (1, BATCH)
+    ]
+
+
+def test_it_measures_both_engines_and_names_what_there_is(monkeypatch, capsys):
+    found = []
+
+    def examine(device: str, examine=doctor.examine):
+        found.append(examine(device, seconds=0.01))
+        return found[0]
+
+    monkeypatch.setattr(doctor, "examine", examine)
+    assert cli.main(["doctor"]) == 0
+    told = capsys.readouterr().out
+    for part in ("devices: ", "XLA_FLAGS: ", f"jax {jax.__version__}", "auto takes", "at once"):
+        assert part in told
+    assert [(rate.engine, rate.batch) for rate in found[0].rates] == [
+        ("mujoco", 1), ("mujoco", BATCH), ("mjx", 1), ("mjx", BATCH),
+    ]  # fmt: skip
+    assert all(rate.steps_per_second > 0 for rate in found[0].rates)
+
+
+def test_advice_follows_from_the_rates_and_the_settings(monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    first, batch, *rest = doctor.advise(rates(2.0, 1.0), "cpu")
+    assert "mujoco is 2.0 times" in first
+    assert "10 times the steps of one" in batch
+    assert not [line for line in rest if "XLA_FLAGS" in line]
+    assert "time yours with --engine mjx" in doctor.advise(rates(1.0, 2.0), "cpu")[0]
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true")
+    monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "false")
+    assert {"XLA_FLAGS", "Compiled"} <= {
+        line.split()[0] for line in doctor.advise(rates(1.0, 1.0), "cpu")
+    }
+
+
+def test_a_device_that_is_not_there_is_one_line_and_status_2(monkeypatch, capsys):
+    def no_device():
+        raise RuntimeError("Unable to initialize backend 'tpu': no libtpu (set JAX_PLATFORMS='')")
+
+    monkeypatch.setattr(jax, "devices", no_device)
+    assert cli.main(["doctor"]) == 2
+    complaint = capsys.readouterr().err
+    assert complaint.startswith("garat: error: JAX finds no device")
+    assert "no libtpu" in complaint
+    assert complaint.count("\n") == 1
+    with pytest.raises(UserError, match="JAX finds no device"):
+        doctor.use("auto")
+
+
+def test_a_device_that_only_shows_later_is_one_line_too(monkeypatch, capsys):
+    def fail(self):
+        raise RuntimeError("Unable to initialize backend 'tpu': no libtpu")
+
+    monkeypatch.setattr(cli.List, "run", fail)
+    assert cli.main(["list"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
