@@ -79,6 +79,14 @@ class Transfer:
     """Physics: MJX, C MuJoCo, or the faster of the two on this machine."""
     device: Device = "auto"
     """What computes."""
+    distributed: bool = False
+    """Work with other processes, started alike, on the devices of all."""
+    coordinator: Annotated[str | None, arg(metavar="HOST:PORT")] = None
+    """Process 0; JAX_COORDINATOR_ADDRESS, Slurm or MPI by default."""
+    num_processes: int | None = None
+    """How many processes; JAX_NUM_PROCESSES, Slurm or MPI by default."""
+    process_id: int | None = None
+    """Which of them, from 0; JAX_PROCESS_ID, Slurm or MPI by default."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder for the results; runs/PAIR-METHOD by default."""
     force: bool = False
@@ -90,17 +98,24 @@ class Transfer:
         """Run the transfer experiment."""
         if self.seeds < 1:
             raise UserError(f"--seeds {self.seeds}: expected 1 or more")
-        from garat_jax.devices import use
+        if self.distributed and self.resume:
+            raise UserError("--distributed cannot go on with a run; leave out --resume")
+        from garat_jax.devices import join_processes, use
         from garat_jax.envs.pairs import PAIRS
         from garat_jax.presets import METHODS
         from garat_jax.summary import describe
         from garat_jax.transfer import run_transfer
 
+        process = 0
+        if self.distributed:
+            process = join_processes(self.coordinator, self.num_processes, self.process_id)
         use(self.device)
         config = choose("method", self.method, METHODS)(
             choose("pair", self.pair, PAIRS), seeds=self.seeds, engine=self.engine
         )
         out = self.out or Path("runs") / f"{self.pair}-{self.method}"
+        if process:  # each writes what it has, and process 0 where it was told to
+            out = out.with_name(f"{out.name}-process-{process}")
         with make_run(self, out, seeds=range(self.seeds), resume=self.resume) as run:
             say(describe(run_transfer(config, run)))
         say(f"report: {run.root / 'report.html'}")

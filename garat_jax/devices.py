@@ -1,5 +1,6 @@
 """The devices that JAX computes on, and how much memory this process has used."""
 
+import os
 import resource
 import sys
 from typing import Any
@@ -31,6 +32,40 @@ def use(device: str) -> list[Any]:
         return jax.devices()
     except RuntimeError as error:
         raise describe(error) from error
+
+
+def join_processes(coordinator: str | None, num_processes: int | None, process: int | None) -> int:
+    """Work with other processes, on the devices of all; before anything asks JAX to compute.
+
+    Args:
+        coordinator: Address and port of process 0.
+        num_processes: How many there are.
+        process: Which of them this is, from 0.
+
+    Returns:
+        Which of them this is. What is None comes from JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES
+        and JAX_PROCESS_ID, or from Slurm or MPI.
+
+    Raises:
+        UserError: The processes do not come together.
+    """
+    try:
+        jax.distributed.initialize(
+            coordinator,
+            _or_variable(num_processes, "JAX_NUM_PROCESSES"),
+            _or_variable(process, "JAX_PROCESS_ID"),
+        )
+    except (RuntimeError, ValueError) as error:
+        raise UserError(
+            f"the processes do not come together: {error}; give --coordinator HOST:PORT, "
+            "--num-processes N and --process-id K"
+        ) from error
+    return jax.process_index()
+
+
+def _or_variable(number: int | None, variable: str) -> int | None:
+    text = os.environ.get(variable)
+    return int(text) if number is None and text else number
 
 
 def describe(error: RuntimeError) -> UserError:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from garat_jax import split
 from garat_jax.env import Env, EnvState
 from garat_jax.types import Params, Policy, Transition
 
@@ -51,10 +52,15 @@ def no_fault(env: Env, state: EnvState) -> Fault:
     return Fault(jnp.zeros((), jnp.int32), nothing, jnp.zeros(env.action_size), nothing)
 
 
-def _step(env: Env, params: Params, policy: Policy, policy_params: Params, state, key):
-    """Step a batch [B] and reset what has ended; return the true next states and faults too."""
-    num_envs = state.steps.shape[0]
-    act_keys, step_keys, reset_keys = jax.random.split(key, (3, num_envs))
+def _step(env: Env, params: Params, policy: Policy, policy_params: Params, state, key, shares=1):
+    """Step a batch [B], or this device's share of one, and reset what has ended.
+
+    Returns:
+        The next states, the transitions, and faults with the true next states.
+    """
+    num_envs = state.steps.shape[0] * shares
+    keys = jax.random.split(key, (3, num_envs))
+    act_keys, step_keys, reset_keys = split.own_share(keys, shares, axis=1)
     action, log_prob = jax.vmap(policy, (None, 0, 0))(policy_params, state.obs, act_keys)
     result = jax.vmap(env.step, (None, 0, 0, 0))(params, state, action, step_keys)
     faulty = ~jax.vmap(_is_sound)((result.state, result.reward))
@@ -117,15 +123,19 @@ def unroll(
     Returns:
         Where the environments stand now, [B], the transitions, [T, B], and what went wrong.
     """
+    shares = split.num_shares(state.steps.shape[0])
 
     def step(carry, key):
         state, fault = carry
-        after, transition, outcome = _step(env, params, policy, policy_params, state, key)
+        after, transition, outcome = _step(env, params, policy, policy_params, state, key, shares)
         return (after, _note(fault, state, outcome)), transition
 
-    carry = (state, no_fault(env, state))
+    carry = (split.own_share(state, shares), no_fault(env, state))
     (state, fault), transitions = jax.lax.scan(step, carry, jax.random.split(key, length))
-    return state, transitions, fault
+    faults = split.join(jax.tree.map(lambda x: x[None], fault), shares)
+    first = jnp.argmax(faults.num_steps > 0)
+    fault = jax.tree.map(lambda x: x[first], faults)._replace(num_steps=faults.num_steps.sum())
+    return split.join(state, shares), split.join(transitions, shares, axis=1), fault
 
 
 def record(
@@ -157,19 +167,20 @@ def evaluate(
     num_episodes: int,
 ) -> jax.Array:
     """Return the undiscounted returns [num_episodes] of whole episodes."""
+    shares = split.num_shares(num_episodes)
 
     def step(carry, key):
         state, alive, total = carry
-        state, transition, _ = _step(env, params, policy, policy_params, state, key)
+        state, transition, _ = _step(env, params, policy, policy_params, state, key, shares)
         total = total + alive * transition.reward
         alive = alive & ~(transition.terminated | transition.truncated)
         return (state, alive, total), None
 
     reset_key, key = jax.random.split(key)
-    state = reset(env, params, reset_key, num_episodes)
-    carry = (state, jnp.ones(num_episodes, bool), jnp.zeros(num_episodes))
+    state = split.own_share(reset(env, params, reset_key, num_episodes), shares)
+    carry = (state, jnp.ones_like(state.steps, bool), jnp.zeros(state.steps.shape))
     keys = jax.random.split(key, env.episode_length)
-    return jax.lax.scan(step, carry, keys)[0][2]
+    return split.join(jax.lax.scan(step, carry, keys)[0][2], shares)
 
 
 def replay(env: Env, params: Params, recorded: Recorded, key: jax.Array) -> jax.Array:

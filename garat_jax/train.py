@@ -8,9 +8,11 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from rich.console import Console
 
-from garat_jax import checkpoint
+from garat_jax import checkpoint, split
+from garat_jax.devices import peak_mebibytes
 from garat_jax.errors import DivergedError
 from garat_jax.interrupt import deferred_interrupt
 from garat_jax.rollout import Fault
@@ -49,12 +51,14 @@ class Trainer:
         seeds: The seeds, in the order of the leading axis of every state.
         seconds: Wall time, added up over the stages.
         console: Where progress goes.
+        mesh: The devices that programs run on; None for one.
     """
 
     run: RunDirectory
     seeds: Sequence[int]
     seconds: Seconds = dataclasses.field(default_factory=Seconds)
     console: Console = dataclasses.field(default_factory=lambda: Console(stderr=True))
+    mesh: Mesh | None = None
 
     def __post_init__(self) -> None:
         """Add the time that earlier processes of a resumed run took."""
@@ -98,19 +102,20 @@ class Trainer:
             return state
         if self.run.resumed:
             self.run.rewind(first, stage)
-        compiled = self._compile(_with_finite(step), (state, params), options)
+        compiled, run = self._compile(_with_finite(step), (state, params), options)
+        self.console.print(f"{stage}: memory {_memory(compiled)}", highlight=False)
         started = time.monotonic()
         try:
-            return self._loop(stage, compiled, state, params, first, num_iterations)
+            return self._loop(stage, run, state, params, first, num_iterations)
         finally:
             self._spent(started)
 
     def call(self, function: Callable, *arguments: Any, options: dict[str, Any] | None = None):
         """Compile a function, call it once, and return its result when it is there."""
-        compiled = self._compile(function, arguments, options)
+        _, run = self._compile(function, arguments, options)
         started = time.monotonic()
         with deferred_interrupt():
-            result = jax.block_until_ready(compiled(*arguments))
+            result = jax.block_until_ready(run(*arguments))
         self._spent(started)
         return result
 
@@ -120,9 +125,12 @@ class Trainer:
 
     def _compile(self, function: Callable, arguments: tuple, options: dict[str, Any] | None):
         started = time.monotonic()
-        compiled = jax.jit(function, compiler_options=options).lower(*arguments).compile()
+        if self.mesh is not None:
+            compiled, run = split.compile_on(self.mesh, function, arguments, options)
+        else:
+            run = compiled = jax.jit(function, compiler_options=options).lower(*arguments).compile()
         self.seconds.compile += time.monotonic() - started
-        return compiled
+        return compiled, run
 
     def _loop(self, stage, step, state, params, first: int, num_iterations: int):
         folder = self.run.path(f"checkpoints/{stage}")
@@ -206,6 +214,19 @@ class Trainer:
             f"the last finite state is in checkpoints/{stage}, the offending one, with the first "
             f"faulty step before and after, in {path}"
         )
+
+
+def _memory(compiled: jax.stages.Compiled) -> str:
+    """Say how much memory a program takes while it runs, and this process at most so far."""
+    process = f"{peak_mebibytes():.0f} MiB of this process so far"
+    sizes = compiled.memory_analysis()
+    if sizes is None:  # not every backend says
+        return process
+    held = sizes.argument_size_in_bytes + sizes.output_size_in_bytes
+    return (
+        f"{held / 2**20:.1f} MiB of states and {sizes.temp_size_in_bytes / 2**20:.1f} MiB on the "
+        f"way in an iteration, {process}"
+    )
 
 
 def _done(stage: str) -> str:

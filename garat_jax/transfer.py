@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from garat_jax import rollout, summary, train
+from garat_jax import rollout, split, summary, train
 from garat_jax.agents import trpo
 from garat_jax.agents.actor_critic import ActorCriticState, PolicyParams
 from garat_jax.agents.trpo import TRPOConfig
@@ -153,7 +153,7 @@ class Experiment:
         """Run a stage with one learner a seed."""
         return self.trainer.train(
             stage,
-            jax.vmap(step, in_axes=(0, axes)),
+            split.over_seeds(step, (0, axes), self.trainer.mesh),
             state,
             params,
             num_iterations,
@@ -163,7 +163,8 @@ class Experiment:
     def map(self, function, *arguments, axes: Any = 0) -> Any:
         """Apply a function to the arguments of every seed; `axes` as `vmap`'s."""
         options = compiler_options(self.worlds.source.params)
-        return self.trainer.call(jax.vmap(function, in_axes=axes), *arguments, options=options)
+        function = split.over_seeds(function, axes, self.trainer.mesh)
+        return self.trainer.call(function, *arguments, options=options)
 
     def target_returns(self, policy: PolicyParams, stage: str) -> np.ndarray:
         """Return the mean return of stochastic policies [seeds] in the target, [seeds]."""
@@ -238,7 +239,8 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
     source, target = config.pair.worlds(config.engine)
     run.record_settings(dataclasses.replace(config, engine=source.params.engine))
     agent = trpo.make(source.env, config.agent)
-    trainer = Trainer(run, range(config.first_seed, config.first_seed + config.seeds))
+    seeds = range(config.first_seed, config.first_seed + config.seeds)
+    trainer = Trainer(run, seeds, mesh=split.make_mesh(config.seeds, config.agent.num_envs))
     keys = jax.vmap(jax.random.key)(jnp.asarray(trainer.seeds))
     experiment = Experiment(config, trainer, Worlds(source, target, agent), keys)
 

@@ -312,4 +312,4 @@ def test_kinds_at_one_target_are_pytrees_of_their_own():
 def test_a_model_that_mjx_cannot_step_is_refused_in_one_line():
     implicit = "<mujoco><option integrator='implicit'/><worldbody/></mujoco>"
     with pytest.raises(UserError, match=r"engine mjx cannot step this model: .*; use mujoco"):
-        dynamics.compile(models.spec(implicit), engine="mjx")
+        dynamics.compile(spec(implicit), engine="mjx")

@@ -106,6 +106,27 @@ def test_the_step_is_the_natural_gradient_of_the_trust_region_length():
     np.testing.assert_allclose(step, length * direction, rtol=0.01, atol=1e-4)
 
 
+def test_fisher_information_of_a_share_of_the_batch_gives_nearly_the_same_step():
+    weights, batch = weights_and_batch(num=640)
+    whole, _ = policy_step(weights, batch, config=CONFIG)
+    part, metrics = policy_step(weights, batch, config=TRPOConfig(fisher_share=0.1))
+    steps = [ravel_pytree(new)[0] - ravel_pytree(weights)[0] for new in (whole, part)]
+    lengths = [jnp.linalg.norm(step) for step in steps]
+    assert steps[0] @ steps[1] > 0.9 * lengths[0] * lengths[1]
+    assert not np.array_equal(*steps)
+    assert 0.1 * CONFIG.max_kl < metrics["kl"] <= 1.5 * CONFIG.max_kl
+    assert metrics["surrogate"] > 0
+
+
+def test_a_share_is_spread_over_the_batch():
+    np.testing.assert_array_equal(trpo.spread(5, 1.0), np.arange(5))
+    np.testing.assert_array_equal(trpo.spread(5, 0.6), [0, 2, 4])
+    assert len(trpo.spread(5, 0.01)) == 1
+    assert len(set(trpo.spread(5000, 0.1) % 50)) == 50  # not always the same environments
+    with pytest.raises(ValueError, match="expected more than 0"):
+        trpo.spread(5, 0.0)
+
+
 def test_without_an_advantage_the_weights_stay():
     weights, batch = weights_and_batch()
     flat_batch = batch._replace(advantage=jnp.zeros_like(batch.advantage))
