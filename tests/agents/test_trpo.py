@@ -107,7 +107,7 @@ def test_the_step_is_the_natural_gradient_of_the_trust_region_length():
 
 
 def test_fisher_information_of_a_share_of_the_batch_gives_nearly_the_same_step():
-    weights, batch = weights_and_batch(num=640)
+    weights, batch = weights_and_batch(num=6400)
     whole, _ = policy_step(weights, batch, config=CONFIG)
     part, metrics = policy_step(weights, batch, config=TRPOConfig(fisher_share=0.1))
     steps = [ravel_pytree(new)[0] - ravel_pytree(weights)[0] for new in (whole, part)]
