@@ -48,7 +48,7 @@ demo: setup
 	@echo "report: $(OUT)/report.html"
 
 test: setup
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 check: static test
 

@@ -169,6 +169,7 @@ def test_a_brax_environment_steps_as_it_does_in_brax(braxs):
     assert (bool(result.terminated), bool(result.truncated)) == (True, False)
 
 
+@pytest.mark.slow
 @OLD_BRAX
 def test_trpo_learns_on_a_brax_environment(braxs):
     env = from_brax(braxs, episode_length=100)

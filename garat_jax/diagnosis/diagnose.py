@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, signals
 from garat_jax.diagnosis.model_card import Model
@@ -76,6 +77,7 @@ def diagnose(
         candidates=outcome.candidates,
         selected=outcome.selected,
         ladder=_ladder(problem, outcome),
+        drifts=find_drifts(problem, outcome.best, everything) if outcome.best else (),
         next_experiment=next_experiment((*outcome.selected, *outcome.candidates[:1])),
     )
 

@@ -76,6 +76,8 @@ class Outcome(NamedTuple):
         selected: The effects kept in the end, with their final parameters.
         floor: Noise floor of the metric on the held-out segments.
         adequate: Whether the model as it is comes near its noise floor in every signal.
+        best: The fit that says most of what is left: all selected effects, or the best candidate
+            that was not; None where nothing is left or nothing was fitted.
     """
 
     before: Fit
@@ -85,6 +87,7 @@ class Outcome(NamedTuple):
     selected: tuple[Candidate, ...]
     floor: float
     adequate: bool
+    best: Fit | None
 
 
 def make_metric(problem: Problem) -> Metric:
@@ -139,7 +142,7 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
     before = settle(problem, problem.simulator.base, start)
     floor = noise_floor(problem, metric, before)
     adequate = not is_above(problem, metric, before, floor)
-    current, steps, first_round = before, [], ()
+    current, steps, first_round, best = before, [], (), None
     for number in range(ROUNDS):
         gap = is_above(problem, metric, current, floor)
         if number and not gap:
@@ -151,6 +154,7 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         judged = _judge(problem, metric, current, scores, contenders, gap)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         candidate, contender = judged[0] if judged else (None, None)
+        best = contender.fit if contender is not None else best
         if candidate is None or contender is None or not candidate.passes:
             break
         current = contender.fit
@@ -161,7 +165,9 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         current = count_timestep(problem, current)
     selected = tuple(_refreshed(problem, step, current) for step in steps)
     candidates = _without_superfluous(first_round, selected)
-    return Outcome(before, current, candidates, tuple(steps), selected, floor.error, adequate)
+    if steps or not is_above(problem, metric, current, floor):
+        best = current if is_above(problem, metric, current, floor) else None
+    return Outcome(before, current, candidates, tuple(steps), selected, floor.error, adequate, best)
 
 
 def _block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):

@@ -8,7 +8,7 @@ import plotly.graph_objects as go
 
 from garat_jax.diagnosis.quality import Quality
 from garat_jax.diagnosis.residuals import Residuals
-from garat_jax.diagnosis.results import Repeated
+from garat_jax.diagnosis.results import Drift, Repeated
 from garat_jax.diagnosis.torque import TorqueError
 from garat_jax.report import COLOURS, SOFT, Figure, Section, Table, styled
 
@@ -187,6 +187,22 @@ def repeatability_section(repeated: Sequence[Repeated]) -> list[Section]:
     caption = "Each recording fitted alone, with its 95 % interval; – where it does not show it."
     text = "\n".join(lines)
     return [Section("The same in every recording?", text, tables=[Table(columns, rows, caption)])]
+
+
+def drift_section(drifts: Sequence[Drift]) -> list[Section]:
+    """Return which parameters change while they are recorded; nothing if none does."""
+    if not drifts:
+        return []
+    lines = [
+        f"- The {drift} (95 % interval of the change {drift.change.low:.3g} to "
+        f"{drift.change.high:.3g}); that explains {100 * drift.share:.0f} % of what else is left."
+        for drift in drifts
+    ]
+    lines.append(
+        "\nA gain that falls is a supply that sags or a motor that warms up; friction that falls "
+        "is grease that warms up. No effect of the catalogue changes with time."
+    )
+    return [Section("What drifts", "\n".join(lines))]
 
 
 def side_by_side_section(comparison: "Comparison") -> list[Section]:

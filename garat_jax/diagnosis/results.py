@@ -157,6 +157,39 @@ class Repeated:
 
 
 @dataclasses.dataclass(frozen=True)
+class Drift:
+    """A parameter that changes while it is recorded.
+
+    Attributes:
+        effect: The effect's kind.
+        target: Where it acts.
+        parameter: The parameter.
+        begin: Its value where the recordings begin.
+        end: Its value where they end, if it changes evenly.
+        change: By how much it changes.
+        p_value: Probability of such a change if the parameter is constant.
+        share: Share of what the constant parameter leaves unexplained.
+    """
+
+    effect: str
+    target: str
+    parameter: str
+    begin: float
+    end: float
+    change: Estimate
+    p_value: float
+    share: float
+
+    def __str__(self) -> str:
+        way = "falls" if self.end < self.begin else "rises"
+        unit = f" {self.change.unit}" if self.change.unit not in ("", "1") else ""
+        return (
+            f"{self.parameter} of {self.effect} at {self.target} {way} from {self.begin:.3g} to "
+            f"{self.end:.3g}{unit} within a recording"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class Diagnosis:
     """Where a model fails and which effect it is missing; fields as in diagnosis.json."""
 
@@ -172,6 +205,7 @@ class Diagnosis:
     selected: tuple[Candidate, ...]
     ladder: tuple[Rung, ...]
     next_experiment: Experiment | None
+    drifts: tuple[Drift, ...] = ()
     repeatability: tuple[Repeated, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
@@ -230,6 +264,7 @@ class Diagnosis:
         for rung in self.ladder:
             added = str(rung.added.named) if rung.added else "the model as it is"
             lines.append(f"  {added}: fit {rung.error_fit:.4g}, held-out {rung.error_holdout:.4g}")
+        lines += [f"  drift: {drift}" for drift in self.drifts]
         if self.next_experiment:
             lines.append(f"  next: {self.next_experiment.how}")
         if self.verdict == "unexplained":

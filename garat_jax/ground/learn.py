@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from garat_jax import checkpoint, train
+from garat_jax import checkpoint
+from garat_jax.compiler_options import compiler_options
 from garat_jax.diagnosis.compare import Comparison, compare
 from garat_jax.diagnosis.diagnose import split
 from garat_jax.diagnosis.measurements import Recording, noise
@@ -163,7 +164,7 @@ def _choose_reach(lesson: Lesson, trainer: Trainer) -> float:
     it the whole range, a small effect would drown in it.
     """
     env, world, seen = lesson.env, lesson.world, lesson.seen
-    options = train.compiler_options(world)
+    options = compiler_options(world)
     change = trainer.call(lambda w: needed_change(env, w, seen), world, options=options)
     return float(min(1.0, np.max(REACH * change / ((env.action_high - env.action_low) / 2))))
 
@@ -174,7 +175,7 @@ def _learn(lesson: Lesson, config: GroundConfig, reach: float, trainer: Trainer)
     if isinstance(config.learner, GATConfig):
         agent = exploring(env, agent, reach)
     method = make_method(env, agent, config.reaching(reach))
-    options = train.compiler_options(world)
+    options = compiler_options(world)
     target = as_transitions(env, seen)
     keys = jax.random.split(jax.random.key(trainer.seeds[0]), 1)
     init = jax.vmap(method.init, (0, None, None, None))

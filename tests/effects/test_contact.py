@@ -69,7 +69,7 @@ def stopping(sliding: float, engine: str, geoms=("ball",)) -> float:
     return float(dynamics.step(world, state, jnp.zeros(1), 50).qpos[1])
 
 
-@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+@pytest.mark.parametrize("engine", [pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
 def test_friction_acts_below_and_above_that_of_the_floor(engine):
     with jax.enable_x64(True):
         travelled = [stopping(sliding, engine) for sliding in (0.1, 0.6, 1.0)]
@@ -79,7 +79,7 @@ def test_friction_acts_below_and_above_that_of_the_floor(engine):
         assert both == pytest.approx(stopping(0.15, engine), abs=1e-6)  # halved twice
 
 
-@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+@pytest.mark.parametrize("engine", [pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
 def test_a_contact_is_as_soft_as_it_is_told(engine):
     def depth(time_constant):
         effect = ContactCompliance("geom/brick", time_constant=time_constant, damping_ratio=1.0)

@@ -1,0 +1,108 @@
+"""Whether a parameter changes while it is recorded: a sagging supply is a gain that falls.
+
+Each fitted parameter's sensitivity, times the time within the recording, is held against what the
+fit left of the residual. Evidence is robust, with blocks of time as the independent units.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+from garat_jax.diagnosis.fit import STEP, Fit
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.problem import (
+    Problem,
+    StartSpace,
+    block_labels,
+    difference_steps,
+    linearise,
+)
+from garat_jax.diagnosis.results import Drift, Estimate
+from garat_jax.effects import unit_at
+
+SIGNIFICANCE = 0.01
+"""Largest p-value, corrected for the number of parameters (Holm's first step)."""
+SMALLEST_SHARE = 0.1
+"""Share of what the fit leaves unexplained that a drift must explain."""
+
+
+def time_in_recording(problem: Problem, recordings: Sequence[Recording]) -> np.ndarray:
+    """Return where each segment's middle lies in its recording, from -0.5 to 0.5, [S]."""
+    s = problem.segments
+    places = []
+    for recording, first, weight in zip(s.recording, s.first, s.weight, strict=True):
+        time = recordings[recording].time
+        middle = time[min(first + int(weight.sum()) // 2, len(time) - 1)]
+        places.append((middle - time[0]) / (time[-1] - time[0]) - 0.5)
+    return np.asarray(places)
+
+
+def find_drifts(
+    problem: Problem, fitted: Fit, recordings: Sequence[Recording]
+) -> tuple[Drift, ...]:
+    """Return the fitted parameters that drift within the recordings, clearest first.
+
+    Args:
+        problem: What was fitted.
+        fitted: The fit whose parameters are tested.
+        recordings: What the segments were cut from, in the order of their indices.
+    """
+    free = tuple(j for j in fitted.free if j not in fitted.frozen)
+    if not free:
+        return ()
+    steps = difference_steps(problem, fitted.theta, free, STEP)
+    lin = linearise(problem, fitted.theta, fitted.start, free, steps)
+    chosen = problem.fitted
+    when = time_in_recording(problem, recordings)[chosen, None, None]
+    columns = lin.parameters[chosen]
+    residual = lin.residual[chosen, :, None]
+    rest = StartSpace(lin.start[chosen]).remove(np.concatenate([columns, residual], axis=2))
+    constant, residual = rest[..., :-1], rest[..., -1].ravel()
+    labels = np.unique(block_labels(problem)[chosen].ravel(), return_inverse=True)[1]
+    found = []
+    for place, j in enumerate(free):
+        both = np.concatenate([constant, (constant * when)[..., place : place + 1]], axis=2)
+        matrix = both.reshape(-1, both.shape[2])
+        change, p_value, share, half = _slope(matrix, residual, labels)
+        if p_value * len(free) < SIGNIFICANCE and share > SMALLEST_SHARE:
+            found.append((p_value, _named(problem, fitted, j, change, half, p_value, share)))
+    return tuple(drift for _, drift in sorted(found, key=lambda pair: pair[0]))
+
+
+def _slope(matrix: np.ndarray, residual: np.ndarray, labels: np.ndarray):
+    """Return the last column's coefficient, its p-value, the share it explains, its half width."""
+    unit = np.linalg.norm(matrix, axis=0)
+    unit = np.where(unit > 0, unit, 1.0)
+    matrix = matrix / unit
+    without = residual - matrix[:, :-1] @ np.linalg.lstsq(matrix[:, :-1], residual, rcond=1e-9)[0]
+    bread = np.linalg.pinv(matrix.T @ matrix, rcond=1e-9)
+    factor = -bread @ (matrix.T @ residual)
+    rest = residual + matrix @ factor
+    scores = np.stack([np.bincount(labels, column * rest) for column in matrix.T], axis=1)
+    num_blocks, num = labels.max() + 1, matrix.shape[1]
+    correction = num_blocks / max(num_blocks - num, 1)
+    deviation = np.sqrt((bread @ (scores.T @ scores) @ bread)[-1, -1] * correction)
+    freedom = max(num_blocks - num, 1)
+    p_value = 2.0 * float(stats.t.sf(abs(factor[-1]) / max(deviation, 1e-300), freedom))
+    share = 1.0 - float(rest @ rest) / max(float(without @ without), 1e-300)
+    half = float(stats.t.ppf(0.975, freedom) * deviation / unit[-1])
+    return float(factor[-1] / unit[-1]), p_value, share, half
+
+
+def _named(problem: Problem, fitted: Fit, j: int, change, half, p_value, share) -> Drift:
+    simulator = problem.simulator
+    slot = simulator.slots[j]
+    effect = simulator.effects[slot.effect]
+    unit = unit_at(slot.parameter, simulator.host, effect.target)
+    middle = float(fitted.theta[j])
+    return Drift(
+        effect=effect.kind,
+        target=effect.target,
+        parameter=slot.parameter.name,
+        begin=middle - change / 2,
+        end=middle + change / 2,
+        change=Estimate(change, change - half, change + half, unit),
+        p_value=p_value,
+        share=share,
+    )
