@@ -1,0 +1,41 @@
+"""A gain that falls while it is recorded is named as such; one that stays is not."""
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.drift import find_drifts
+from garat_jax.diagnosis.fit import fit
+from garat_jax.effects import MotorGain
+from tests.diagnosis.test_fit import make_problem, record
+
+TIME = np.arange(0, 8, 0.004)
+
+
+def drifts(fall: float):
+    """Record a motor whose gain falls evenly from 1, by telling the model more than it gets."""
+    gain = 1.0 - fall * TIME / TIME[-1]
+    recordings = []
+    for seed in range(2):
+        made = record(TIME, seed=seed, command=gain)
+        recordings.append(made.__class__(**{**vars(made), "ctrl": made.ctrl / gain[:, None]}))
+    problem = make_problem(recordings, (MotorGain(target="actuator/motor", scale=1.0),))
+    fitted = fit(problem, problem.simulator.base, problem.segments.start, (0,))
+    return fitted, find_drifts(problem, fitted, recordings)
+
+
+def test_a_gain_that_falls_is_named_with_its_ends():
+    fitted, (drift,) = drifts(0.3)
+    assert (drift.effect, drift.target, drift.parameter) == (
+        "motor_gain",
+        "actuator/motor",
+        "scale",
+    )
+    assert (drift.begin, drift.end) == pytest.approx((1.0, 0.7), abs=0.02)
+    assert drift.change.low < -0.3 < drift.change.high
+    assert fitted.theta[0] == pytest.approx(0.85, abs=0.03)
+    assert str(drift).startswith("scale of motor_gain at actuator/motor falls from 1")
+
+
+def test_a_gain_that_stays_is_not():
+    _, found = drifts(0.0)
+    assert found == ()
