@@ -6,8 +6,9 @@ through its C interface for foreign functions, and the handler looks the name up
 that this process traced. The handler is made with ctypes: nothing has to be compiled.
 
 The structures below are those of xla/ffi/api/c_api.h, which comes with jaxlib, as of version 0.1 of
-that interface. Where XLA does not take the handler, and on accelerators, `jax.pure_callback`
-serves, and the program is compiled at every start.
+that interface. Where XLA does not take the handler, on accelerators, and with several CPU devices
+(where processes that had called the handler crashed at their end), `jax.pure_callback` serves, and
+the program is compiled at every start.
 """
 
 import ctypes
@@ -50,7 +51,7 @@ def call(name: str, function: HostFunction, size: int, inputs: Sequence[jax.Arra
         The result's 32-bit words, [size].
     """
     shape = jax.ShapeDtypeStruct((size,), jnp.uint32)
-    if jax.default_backend() != "cpu" or not _is_registered():
+    if jax.default_backend() != "cpu" or jax.local_device_count() > 1 or not _is_registered():
         return jax.pure_callback(
             lambda *arrays: function([np.asarray(array) for array in arrays]),
             shape,
@@ -201,6 +202,7 @@ def _is_registered() -> bool:
     try:
         capsule = jax.ffi.pycapsule(ctypes.cast(_handler, ctypes.c_void_p))
         jax.ffi.register_ffi_target(TARGET, capsule, platform="cpu")
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(_handler))  # XLA keeps its address to the end
     except jax.errors.JaxRuntimeError:
         return False
     return True

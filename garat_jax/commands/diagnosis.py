@@ -1,6 +1,7 @@
 """Commands that hold a model against recordings: compare, diagnose, improve, ground, plan."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -64,6 +65,9 @@ class Diagnose:
     """Recordings (CSV, Parquet or NPZ), one a file."""
     holdout: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Recordings to prove the result on; by default some of DATA are held out."""
+    condition: Annotated[tuple[str, ...], arg(metavar="NAME=FILE...")] = ()
+    """Recordings under other conditions, such as with a payload: what DATA shows is shared by all,
+    what these show besides is theirs."""
     map: Annotated[Path | None, arg(metavar="MAP.toml")] = None
     """How the recordings' columns are named, and in which units."""
     effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
@@ -79,14 +83,31 @@ class Diagnose:
         check_files(self.data, "DATA")
         check_files(self.holdout or self.data, "--holdout")
         check_optional(self.map, "--map")
+        conditions = parse_conditions(self.condition)
         from garat_jax.diagnosis import run_diagnose
         from garat_jax.effects.catalogue import load_catalogue
 
         catalogue = load_catalogue(self.effects)
         out = self.out or Path("runs") / f"diagnose-{self.model.stem}"
         with make_run(self, out) as run:
-            run_diagnose(self.model, self.data, self.holdout, run, self.map, catalogue)
+            run_diagnose(self.model, self.data, self.holdout, run, self.map, catalogue, conditions)
         say(f"report: {run.root / 'report.html'}")
+
+
+def parse_conditions(given: Sequence[str]) -> dict[str, list[Path]]:
+    """Read NAME=FILE words into the files of each condition.
+
+    Raises:
+        UserError: A word is no NAME=FILE, or there is no such file.
+    """
+    conditions: dict[str, list[Path]] = {}
+    for word in given:
+        name, equals, file = word.partition("=")
+        if not (name and equals and file):
+            raise UserError(f"--condition: {word!r} is not NAME=FILE, as in loaded=run3.csv")
+        check_files([Path(file)], "--condition")
+        conditions.setdefault(name, []).append(Path(file))
+    return conditions
 
 
 @dataclasses.dataclass(frozen=True)

@@ -41,6 +41,7 @@ def diagnose(
     recordings: Sequence[Recording],
     holdout: Sequence[Recording] = (),
     say: Callable[[str], None] = lambda message: None,
+    add_to_present: bool = False,
 ) -> Diagnosis:
     """Find where a model fails and which physical effects it is missing.
 
@@ -50,12 +51,13 @@ def diagnose(
         holdout: Recordings to prove the result on. Without any, the last quarter of the recordings
             is held out; of a single recording, its last third.
         say: Told what is being done.
+        add_to_present: Whether an effect that the model already has at a place is tried once more.
     """
     started = time.monotonic()
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
     host = native_model(model.compile(engine="mujoco"))
-    candidates = make_candidates(model, host)
+    candidates = make_candidates(model, host, add_to_present)
     grid = choose_grid(everything, host.opt.timestep)
     simulator = Simulator(model, candidates, grid)
     say("choosing the horizon")
@@ -117,7 +119,9 @@ def _every(r: Recording, step: int) -> Recording:
     )
 
 
-def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
+def make_candidates(
+    model: Model, host: mujoco.MjModel, add_to_present: bool = False
+) -> tuple[Effect, ...]:
     """Make every effect of the catalogue at every place of a model, each without effect.
 
     With one actuator, `all` is that actuator.
@@ -127,7 +131,7 @@ def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
     for kind, cls in model.catalogue.items():
         for target in cls.targets(host):
             alone = target == "all" and "actuator" in cls.elements and host.nu < 2
-            if alone or (kind, target) in present:
+            if alone or ((kind, target) in present and not add_to_present):
                 continue
             candidates.append(cls(target=target, **cls.at(host, target)))
     return tuple(candidates)

@@ -300,7 +300,7 @@ def _estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate
             at = fitted.free.index(j)
             low, high = float(fitted.low[at]), float(fitted.high[at])
             estimates[slot.parameter.name] = Estimate(float(fitted.theta[j]), low, high, unit)
-        elif fitted.theta[j] != slot.base:
+        elif fitted.theta[j] != slot.parameter.nominal:
             value = float(fitted.theta[j])
             estimates[slot.parameter.name] = Estimate(value, float("nan"), float("nan"), unit)
     return estimates

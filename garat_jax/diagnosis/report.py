@@ -15,6 +15,7 @@ from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.report_data import (
+    conditions_section,
     drift_section,
     recordings_section,
     repeatability_section,
@@ -115,6 +116,7 @@ def diagnosis_sections(
         *_ranking(diagnosis),
         *_ladder(diagnosis),
         *_parameters(diagnosis, model),
+        *conditions_section(diagnosis),
         *drift_section(diagnosis.drifts),
         *repeatability_section(diagnosis.repeatability),
         *_next(diagnosis),

@@ -8,7 +8,7 @@ import plotly.graph_objects as go
 
 from garat_jax.diagnosis.quality import Quality
 from garat_jax.diagnosis.residuals import Residuals
-from garat_jax.diagnosis.results import Drift, Repeated
+from garat_jax.diagnosis.results import Diagnosis, Drift, Repeated
 from garat_jax.diagnosis.torque import TorqueError
 from garat_jax.report import COLOURS, SOFT, Figure, Section, Table, styled
 
@@ -203,6 +203,23 @@ def drift_section(drifts: Sequence[Drift]) -> list[Section]:
         "is grease that warms up. No effect of the catalogue changes with time."
     )
     return [Section("What drifts", "\n".join(lines))]
+
+
+def conditions_section(diagnosis: Diagnosis) -> list[Section]:
+    """Return which parameters all conditions share and which are one's own; nothing without any."""
+    if not diagnosis.conditions:
+        return []
+    found = [("all", c) for c in diagnosis.selected]
+    found += [(name, c) for name, other in diagnosis.conditions.items() for c in other.selected]
+    rows = [
+        (name, str(c.named).replace("_", " "), parameter, e.estimate, e.low, e.high, e.unit)
+        for name, c in found
+        for parameter, e in c.parameters.items()
+    ]
+    columns = ["condition", "effect", "parameter", "estimate", "low", "high", "unit"]
+    text = "\n".join(f"- {name}: {d.sentence}" for name, d in diagnosis.conditions.items())
+    caption = "Effects of all conditions come from the base recordings; the others have them too."
+    return [Section("Under other conditions", text, tables=[Table(columns, rows, caption)])]
 
 
 def side_by_side_section(comparison: "Comparison") -> list[Section]:

@@ -82,6 +82,14 @@ class Candidate:
         """The effect and its place."""
         return Named(self.effect, self.target)
 
+    @property
+    def sizes(self) -> str:
+        """The parameters with their intervals and units."""
+        return ", ".join(
+            f"{name} {v.estimate:.4g} [{v.low:.4g}, {v.high:.4g}] {v.unit}"
+            for name, v in self.parameters.items()
+        )
+
 
 @dataclasses.dataclass(frozen=True)
 class Rung:
@@ -191,7 +199,11 @@ class Drift:
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """Where a model fails and which effect it is missing; fields as in diagnosis.json."""
+    """Where a model fails and which effect it is missing; fields as in diagnosis.json.
+
+    `conditions` holds the diagnoses of recordings made under other conditions, in which the model
+    has the effects that were selected here.
+    """
 
     model: str
     data: tuple[str, ...]
@@ -207,10 +219,13 @@ class Diagnosis:
     next_experiment: Experiment | None
     drifts: tuple[Drift, ...] = ()
     repeatability: tuple[Repeated, ...] = ()
+    conditions: Mapping[str, "Diagnosis"] = dataclasses.field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json; what is not finite is null."""
-        return {"format": FORMAT, **finite_or_null(to_plain(self))}
+        plain = to_plain(dataclasses.replace(self, conditions={}))
+        plain["conditions"] = {name: found.to_json() for name, found in self.conditions.items()}
+        return {"format": FORMAT, **finite_or_null(plain)}
 
     def plot(self, what: str = "ladder") -> go.Figure:
         """Draw the `ladder` of errors, the `ranking` of effects, or `where` the model fails.
@@ -253,12 +268,8 @@ class Diagnosis:
         lines = [self.sentence]
         lines += [f"  where: {place.evidence}" for place in self.where[:3]]
         for c in self.candidates[:6]:
-            values = ", ".join(
-                f"{name} {v.estimate:.4g} [{v.low:.4g}, {v.high:.4g}] {v.unit}"
-                for name, v in c.parameters.items()
-            )
             lines.append(
-                f"  {'*' if c.passes else ' '} {c.named}: {values}; share {c.share:.2f}, "
+                f"  {'*' if c.passes else ' '} {c.named}: {c.sizes}; share {c.share:.2f}, "
                 f"held-out error {c.error_after:.3g}, stability {c.stability:.2f}; {c.why}"
             )
         for rung in self.ladder:
@@ -269,4 +280,7 @@ class Diagnosis:
             lines.append(f"  next: {self.next_experiment.how}")
         if self.verdict == "unexplained":
             lines.append(f"  or: {OFFER}")
+        for name, found in self.conditions.items():
+            lines.append(f"Under the condition {name}, with the above: {found.sentence}")
+            lines += [f"  {c.named}: {c.sizes}" for c in found.selected]
         return "\n".join(lines)

@@ -1,14 +1,14 @@
 """The command `garat diagnose`: read the files, diagnose, write diagnosis.json and report.html."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
 
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.diagnose import diagnose
+from garat_jax.diagnosis.conditions import diagnose_conditions
 from garat_jax.diagnosis.model_card import load_model
 from garat_jax.diagnosis.repeat import repeatability
 from garat_jax.diagnosis.report import diagnosis_sections, write_diagnosis
@@ -33,6 +33,7 @@ def run_diagnose(
     run: RunDirectory,
     columns: Path | None = None,
     catalogue: Catalogue = CATALOGUE,
+    conditions: Mapping[str, Sequence[Path]] | None = None,
 ) -> Diagnosed:
     """Diagnose a model file with recordings; write diagnosis.json and report.html into a run.
 
@@ -43,14 +44,18 @@ def run_diagnose(
         run: Where to write.
         columns: Map of the recordings' columns.
         catalogue: The kinds of effect that may be missing.
+        conditions: Recordings made under other conditions than `data`, by the condition's name.
 
     Raises:
         UserError: A file cannot be read or does not fit the model.
     """
     loaded = load_model(model, catalogue)
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
+    others = {
+        name: read_recordings(loaded, paths, columns) for name, paths in (conditions or {}).items()
+    }
     with Console(stderr=True).status("reading the recordings") as status:
-        diagnosis = diagnose(loaded, recordings, held_out, status.update)
+        diagnosis = diagnose_conditions(loaded, recordings, others, held_out, status.update)
         again = repeatability(loaded, recordings, held_out, diagnosis.selected, status.update)
         diagnosis = dataclasses.replace(diagnosis, repeatability=again)
         run.write_json("diagnosis.json", diagnosis.to_json())
