@@ -40,21 +40,25 @@ def to_gymnasium(env: Env, params: Params) -> "GymnasiumEnv":
     return _gymnasium_side().GymnasiumEnv(env, params)
 
 
-def to_gymnasium_vector(env: Env, params: Params, num_envs: int) -> "GymnasiumVectorEnv":
+def to_gymnasium_vector(
+    env: Env, params: Params, num_envs: int, same_step: bool = True
+) -> "GymnasiumVectorEnv":
     """Make a batch of environments, stepped as one program, one of Gymnasium's vector environments.
 
-    An environment whose episode ends is reset within the same step (`AutoresetMode.SAME_STEP`): the
+    By default one whose episode ends is reset within the same step (`AutoresetMode.SAME_STEP`): the
     observation before the reset is `infos["final_obs"][i]` where `infos["_final_obs"][i]` is true.
 
     Args:
         env: The environment.
         params: Its parameters, the same for all.
         num_envs: How many.
+        same_step: Whether they are reset within the step; otherwise the next step resets them
+            (`AutoresetMode.NEXT_STEP`), as Gymnasium's vector wrappers of observations want it.
 
     Raises:
         UserError: Gymnasium is not installed.
     """
-    return _gymnasium_side().GymnasiumVectorEnv(env, params, num_envs)
+    return _gymnasium_side().GymnasiumVectorEnv(env, params, num_envs, same_step)
 
 
 def _gymnasium_side():

@@ -128,7 +128,7 @@ def from_brax(env: Any, episode_length: int) -> BraxSource:
     Raises:
         UserError: The environment is wrapped, or its observation is not one vector.
     """
-    if isinstance(env, brax.envs.base.Wrapper):
+    if env.unwrapped is not env:
         raise UserError(f"{type(env).__name__} wraps the environment; give the one that is inside")
     if not isinstance(env.observation_size, int):
         raise UserError(f"observations must be one vector, not {env.observation_size}")

@@ -1,5 +1,6 @@
 """Our environments as Gymnasium's, one by one or as a vector."""
 
+import functools
 from typing import Any
 
 import gymnasium
@@ -10,7 +11,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from garat_jax.env import Env, EnvState
+from garat_jax.env import Env, EnvState, StepResult
 from garat_jax.types import Params
 
 
@@ -79,28 +80,20 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     Each of them does what a `GymnasiumEnv` with its seed does.
     """
 
-    def __init__(self, env: Env, params: Params, num_envs: int):
+    def __init__(self, env: Env, params: Params, num_envs: int, same_step: bool = True):
+        mode = AutoresetMode.SAME_STEP if same_step else AutoresetMode.NEXT_STEP
         self.num_envs = num_envs
-        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.metadata = {"render_modes": [], "autoreset_mode": mode}
         self.render_mode = None
         self.single_observation_space, self.single_action_space = _spaces(env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._params = params
-        self._states = self._keys = None
-
-        def step(params: Params, state: EnvState, action: jax.Array, key: jax.Array):
-            step_key, key = jax.random.split(key)
-            result = env.step(params, state, action, step_key)
-            fresh = _start(env, params, key)
-            done = result.terminated | result.truncated
-            state, key = jax.tree.map(
-                lambda new, old: jnp.where(done, new, old), fresh, (result.state, key)
-            )
-            return result, state, key
-
+        self._states = self._keys = self._over = None
+        self._same_step = same_step
+        step = functools.partial(_step_and_reset if same_step else _reset_or_step, env)
         self._start = jax.jit(jax.vmap(lambda params, key: _start(env, params, key), (None, 0)))
-        self._step = jax.jit(jax.vmap(step, (None, 0, 0, 0)))
+        self._step = jax.jit(jax.vmap(step, (None, 0, 0, 0, 0)))
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -121,12 +114,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             randoms = [seeding.np_random(seed)[0] for seed in seeds]
             self._keys = jnp.stack([_first_key(random) for random in randoms])
         self._states, self._keys = self._start(self._params, self._keys)
+        self._over = np.zeros(self.num_envs, bool)
         return np.asarray(self._states.obs, np.float32), {}
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Take one control step in each, and reset those whose episode ended.
+        """Take one control step in each, and reset those whose episode ended: now or before.
 
         Raises:
             ResetNeeded: The environments have not been reset yet.
@@ -135,12 +129,40 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         actions = np.asarray(actions, np.float32)
         result, self._states, self._keys = self._step(
-            self._params, self._states, actions, self._keys
+            self._params, self._states, actions, self._keys, self._over
         )
         terminated, truncated = np.asarray(result.terminated), np.asarray(result.truncated)
-        infos = _final(np.asarray(result.state.obs, np.float32), terminated | truncated)
+        infos = {}
+        if self._same_step:
+            infos = _final(np.asarray(result.state.obs, np.float32), terminated | truncated)
+        else:
+            self._over = terminated | truncated
         obs = np.asarray(self._states.obs, np.float32)
         return obs, np.asarray(result.reward, np.float64), terminated, truncated, infos
+
+
+def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def _step_and_reset(env: Env, params: Params, state: EnvState, action, key, over):
+    """Take one control step, and start anew if it ends the episode."""
+    del over
+    step_key, key = jax.random.split(key)
+    result = env.step(params, state, action, step_key)
+    done = result.terminated | result.truncated
+    state, key = _select(done, _start(env, params, key), (result.state, key))
+    return result, state, key
+
+
+def _reset_or_step(env: Env, params: Params, state: EnvState, action, key, over):
+    """Start anew if the episode is over already; otherwise take one control step."""
+    step_key, next_key = jax.random.split(key)
+    result = env.step(params, state, action, step_key)
+    fresh = _start(env, params, key)
+    nothing = StepResult(fresh[0], *jax.tree.map(jnp.zeros_like, tuple(result[1:])))
+    result = _select(over, nothing, result)
+    return result, result.state, _select(over, fresh[1], next_key)
 
 
 def _final(obs: np.ndarray, done: np.ndarray) -> dict[str, Any]:
