@@ -1,18 +1,28 @@
 """Recordings of one rig under several conditions: with and without a payload, cold and warm.
 
-What is found in the recordings of the base condition is shared: it is part of the model when the
-recordings of every other condition are diagnosed. What is found there in addition is that
-condition's own.
+What is found in the recordings of the base condition is shared: the model has it when those of
+every other condition are diagnosed. What is found there is that condition's own; it may be a shared
+effect of another size. At the end all parameters are fitted to all recordings.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
-from garat_jax.diagnosis.diagnose import diagnose
+import numpy as np
+
+from garat_jax.diagnosis.diagnose import choose_horizon, diagnose, split, thin
+from garat_jax.diagnosis.fit import count_timestep, fit
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.results import Diagnosis
-from garat_jax.diagnosis.view import repaired
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.rank import estimates
+from garat_jax.diagnosis.results import Candidate, Diagnosis
+from garat_jax.diagnosis.segments import Segments, choose_grid
+from garat_jax.diagnosis.simulate import Simulator, Slot
+from garat_jax.diagnosis.view import as_effects
+from garat_jax.dynamics import native_model
+from garat_jax.effects import Effect
 
 
 def diagnose_conditions(
@@ -33,12 +43,132 @@ def diagnose_conditions(
 
     Returns:
         The diagnosis of the base condition, with that of each other one in `conditions`: there the
-        model has the shared effects, and one that is stronger there is found as a second one.
+        model has the shared effects, and a selected one of the same kind and place replaces one.
+        The selected effects' parameters are those that fit the recordings of all conditions.
     """
     base = diagnose(model, recordings, holdout, say)
-    shared = repaired(model, base.selected)
+    shared = as_effects(model, base.selected)
     found = {}
     for name, measured in conditions.items():
         say(f"the condition {name}")
-        found[name] = diagnose(shared, measured, say=say, add_to_present=True)
+        found[name] = diagnose(model, measured, say=say, shared=shared)
+    diagnoses = (base, *found.values())
+    if conditions and any(d.selected for d in diagnoses):
+        say("fitting all conditions together")
+        fitted = [split(recordings, holdout)[0], *(split(c, ())[0] for c in conditions.values())]
+        base, *others = _fit_together(model, fitted, diagnoses)
+        found = dict(zip(found, others, strict=True))
     return dataclasses.replace(base, conditions=found)
+
+
+class _Place(NamedTuple):
+    """What one parameter of all conditions together stands for.
+
+    Attributes:
+        column: The parameter in one condition's `theta`.
+        condition: The condition that it belongs to; 0 for all that have no own value.
+    """
+
+    column: int
+    condition: int
+
+
+class JointSimulator:
+    """One simulator for the segments of several conditions, with shared and own parameters.
+
+    It stands for a `Simulator` where parameters are fitted.
+
+    Attributes:
+        effects: The effects shared by all, then each condition's own.
+        slots: Their parameters, in the order of `theta`.
+        base: Values to begin with, [num_parameters].
+    """
+
+    def __init__(
+        self, simulator: Simulator, selected: Sequence[Sequence[Effect]], condition: np.ndarray
+    ):
+        """Lay the parameters out.
+
+        Args:
+            simulator: Simulates one condition; it holds every kind and place that was selected.
+            selected: The effects of each condition, the shared ones first.
+            condition: Which condition each recording was made in.
+        """
+        self._simulator, self._condition = simulator, condition
+        self.effects = tuple(effect for own in selected for effect in own)
+        index = {(e.kind, e.target): i for i, e in enumerate(simulator.effects)}
+        owners = [number for number, own in enumerate(selected) for _ in own]
+        slots, places = [], []
+        for number, (owner, effect) in enumerate(zip(owners, self.effects, strict=True)):
+            for column, slot in enumerate(simulator.slots):
+                if slot.effect == index[effect.kind, effect.target]:
+                    value = float(getattr(effect, slot.parameter.name))
+                    slots.append(Slot(number, slot.parameter, value))
+                    places.append(_Place(column, owner))
+        self.slots, self._places = tuple(slots), tuple(places)
+        self.base = np.asarray([slot.base for slot in slots])
+
+    @property
+    def host(self):
+        """The compiled MuJoCo model."""
+        return self._simulator.host
+
+    def predict(self, theta: np.ndarray, start: np.ndarray, segments: Segments) -> np.ndarray:
+        """Predict every segment's signals under its own condition; see `Simulator.predict`."""
+        result = np.empty((len(theta), *segments.measured.shape))
+        conditions = self._condition[segments.recording]
+        for number in np.unique(conditions):
+            here = conditions == number
+            there = self._under(theta, int(number))
+            result[:, here] = self._simulator.predict(there, start[:, here], segments.take(here))
+        return result
+
+    def _under(self, theta: np.ndarray, condition: int) -> np.ndarray:
+        """Return the parameters of one condition [P, columns] from all [P, num_parameters]."""
+        own = np.tile(self._simulator.base, (len(theta), 1))
+        for owner in (0, condition):
+            for j, place in enumerate(self._places):
+                if place.condition == owner:
+                    own[:, place.column] = theta[:, j]
+        return own
+
+
+def _fit_together(
+    model: Model, recordings: Sequence[Sequence[Recording]], diagnoses: Sequence[Diagnosis]
+) -> list[Diagnosis]:
+    """Fit what was selected to the recordings of all conditions; return the diagnoses with it."""
+    everything = thin([r for some in recordings for r in some])
+    condition = np.repeat(np.arange(len(recordings)), [len(some) for some in recordings])
+    selected = [as_effects(model, d.selected) for d in diagnoses]
+    kinds = {(e.kind, e.target): e for own in selected for e in own}
+    host = native_model(model.compile(engine="mujoco"))
+    grid = choose_grid(everything, host.opt.timestep)
+    unmoved = [type(e)(target=e.target, **e.at(host, e.target)) for e in kinds.values()]
+    joint, finer = (
+        JointSimulator(Simulator(model, unmoved, grid, refine), selected, condition)
+        for refine in (1, 2)
+    )
+    shared = dataclasses.replace(model, effects=(*model.effects, *selected[0]))
+    _, segments = choose_horizon(Simulator(shared, (), grid), everything, grid)
+    fitted = np.ones(len(segments.start), bool)
+    problem = Problem(joint, finer, segments, fitted, grid.interval * grid.per_sample)
+    candidates = [c for d in diagnoses for c in d.selected]
+    free = [
+        j
+        for j, slot in enumerate(joint.slots)
+        if _is_fitted(candidates[slot.effect], slot.parameter.name)
+    ]
+    best = count_timestep(problem, fit(problem, joint.base, segments.start, free))
+    refined = iter(
+        dataclasses.replace(c, parameters=estimates(problem, number, best))
+        for number, c in enumerate(candidates)
+    )
+    return [
+        dataclasses.replace(d, selected=tuple(next(refined) for _ in d.selected)) for d in diagnoses
+    ]
+
+
+def _is_fitted(candidate: Candidate, parameter: str) -> bool:
+    """Say whether the candidate's own diagnosis fitted one of its parameters."""
+    estimate = candidate.parameters.get(parameter)
+    return estimate is not None and bool(np.isfinite([estimate.low, estimate.high]).all())

@@ -14,7 +14,7 @@ CONTENDERS = 4
 HOPELESS = 8.0
 """What a candidate is expected to leave unexplained, relative to what the best one left when it was
 fitted, above which it is not fitted; the runner-up always is."""
-CONTENDER_STEPS = 6
+CONTENDER_STEPS = 12
 """Gauss-Newton steps of a contender, which starts where screening expects it."""
 
 

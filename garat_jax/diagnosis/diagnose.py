@@ -41,7 +41,7 @@ def diagnose(
     recordings: Sequence[Recording],
     holdout: Sequence[Recording] = (),
     say: Callable[[str], None] = lambda message: None,
-    add_to_present: bool = False,
+    shared: Sequence[Effect] = (),
 ) -> Diagnosis:
     """Find where a model fails and which physical effects it is missing.
 
@@ -51,19 +51,23 @@ def diagnose(
         holdout: Recordings to prove the result on. Without any, the last quarter of the recordings
             is held out; of a single recording, its last third.
         say: Told what is being done.
-        add_to_present: Whether an effect that the model already has at a place is tried once more.
+        shared: Effects that act besides the model's own, and of which each may be another here: one
+            that is selected takes its place.
     """
     started = time.monotonic()
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
-    host = native_model(model.compile(engine="mujoco"))
-    candidates = make_candidates(model, host, add_to_present)
+    whole = dataclasses.replace(model, effects=(*model.effects, *shared))
+    host = native_model(whole.compile(engine="mujoco"))
+    others = make_candidates(whole, native_model(model.compile(engine="mujoco")))
     grid = choose_grid(everything, host.opt.timestep)
-    simulator = Simulator(model, candidates, grid)
     say("choosing the horizon")
-    horizon, segments = choose_horizon(Simulator(model, (), grid), everything, grid)
+    horizon, segments = choose_horizon(Simulator(whole, (), grid), everything, grid)
+    simulator, finer = (
+        Simulator(model, (*shared, *others), grid, refine, acting=range(len(shared)))
+        for refine in (1, 2)
+    )
     sample = grid.interval * grid.per_sample
-    finer = Simulator(model, candidates, grid, refine=2)
     problem = Problem(simulator, finer, segments, segments.recording < len(fitted), sample)
     outcome = explain(problem, segments.start, say)
     error = _errors(problem, outcome, host, f"{how}, segments of {horizon:g} s")
@@ -119,9 +123,7 @@ def _every(r: Recording, step: int) -> Recording:
     )
 
 
-def make_candidates(
-    model: Model, host: mujoco.MjModel, add_to_present: bool = False
-) -> tuple[Effect, ...]:
+def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
     """Make every effect of the catalogue at every place of a model, each without effect.
 
     With one actuator, `all` is that actuator.
@@ -131,7 +133,7 @@ def make_candidates(
     for kind, cls in model.catalogue.items():
         for target in cls.targets(host):
             alone = target == "all" and "actuator" in cls.elements and host.nu < 2
-            if alone or ((kind, target) in present and not add_to_present):
+            if alone or (kind, target) in present:
                 continue
             candidates.append(cls(target=target, **cls.at(host, target)))
     return tuple(candidates)

@@ -17,12 +17,14 @@ from garat_jax.diagnosis.problem import (
     block_labels,
     difference_steps,
     linearise,
+    tall,
 )
 from garat_jax.diagnosis.results import Drift, Estimate
+from garat_jax.diagnosis.robust import regress
 from garat_jax.effects import unit_at
 
 SIGNIFICANCE = 0.01
-"""Largest p-value, corrected for the number of parameters (Holm's first step)."""
+"""Largest p-value, corrected for the number of parameters (Bonferroni)."""
 SMALLEST_SHARE = 0.1
 """Share of what the fit leaves unexplained that a drift must explain."""
 
@@ -59,35 +61,25 @@ def find_drifts(
     residual = lin.residual[chosen, :, None]
     rest = StartSpace(lin.start[chosen]).remove(np.concatenate([columns, residual], axis=2))
     constant, residual = rest[..., :-1], rest[..., -1].ravel()
-    labels = np.unique(block_labels(problem)[chosen].ravel(), return_inverse=True)[1]
+    labels = block_labels(problem)[chosen].ravel()
     found = []
     for place, j in enumerate(free):
         both = np.concatenate([constant, (constant * when)[..., place : place + 1]], axis=2)
-        matrix = both.reshape(-1, both.shape[2])
-        change, p_value, share, half = _slope(matrix, residual, labels)
+        change, p_value, share, half = _slope(tall(both), residual, labels)
         if p_value * len(free) < SIGNIFICANCE and share > SMALLEST_SHARE:
             found.append((p_value, _named(problem, fitted, j, change, half, p_value, share)))
     return tuple(drift for _, drift in sorted(found, key=lambda pair: pair[0]))
 
 
-def _slope(matrix: np.ndarray, residual: np.ndarray, labels: np.ndarray):
+def _slope(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray):
     """Return the last column's coefficient, its p-value, the share it explains, its half width."""
-    unit = np.linalg.norm(matrix, axis=0)
-    unit = np.where(unit > 0, unit, 1.0)
-    matrix = matrix / unit
-    without = residual - matrix[:, :-1] @ np.linalg.lstsq(matrix[:, :-1], residual, rcond=1e-9)[0]
-    bread = np.linalg.pinv(matrix.T @ matrix, rcond=1e-9)
-    factor = -bread @ (matrix.T @ residual)
-    rest = residual + matrix @ factor
-    scores = np.stack([np.bincount(labels, column * rest) for column in matrix.T], axis=1)
-    num_blocks, num = labels.max() + 1, matrix.shape[1]
-    correction = num_blocks / max(num_blocks - num, 1)
-    deviation = np.sqrt((bread @ (scores.T @ scores) @ bread)[-1, -1] * correction)
-    freedom = max(num_blocks - num, 1)
-    p_value = 2.0 * float(stats.t.sf(abs(factor[-1]) / max(deviation, 1e-300), freedom))
-    share = 1.0 - float(rest @ rest) / max(float(without @ without), 1e-300)
-    half = float(stats.t.ppf(0.975, freedom) * deviation / unit[-1])
-    return float(factor[-1] / unit[-1]), p_value, share, half
+    without = regress(columns[:, :-1], residual, labels).rest
+    found = regress(columns, residual, labels)
+    change, deviation = found.coefficient[-1], np.sqrt(found.covariance[-1, -1])
+    p_value = 2.0 * float(stats.t.sf(abs(change) / max(deviation, 1e-300), found.freedom))
+    share = 1.0 - float(found.rest @ found.rest) / max(float(without @ without), 1e-300)
+    half = float(stats.t.ppf(0.975, found.freedom) * deviation)
+    return float(change), p_value, share, half
 
 
 def _named(problem: Problem, fitted: Fit, j: int, change, half, p_value, share) -> Drift:

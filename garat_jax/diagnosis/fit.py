@@ -17,7 +17,9 @@ from garat_jax.diagnosis.problem import (
     block_labels,
     difference_steps,
     linearise,
+    tall,
 )
+from garat_jax.diagnosis.robust import regress
 
 STEP = 1e-2
 """Finite difference of a fit, relative to a parameter's `scale` or size."""
@@ -201,8 +203,7 @@ def fit(
 def _projected(problem: Problem, lin: Linearisation) -> tuple[np.ndarray, np.ndarray]:
     """Return the fitted segments' sensitivities [M, k] and residual [M], initial states removed."""
     both = np.concatenate([lin.parameters, lin.residual[..., None]], axis=2)[problem.fitted]
-    rest = StartSpace(lin.start[problem.fitted]).remove(both)
-    rest = rest.reshape(rest.shape[0] * rest.shape[1], rest.shape[2])
+    rest = tall(StartSpace(lin.start[problem.fitted]).remove(both))
     return rest[:, :-1], rest[:, -1]
 
 
@@ -244,23 +245,12 @@ def _interval(problem: Problem, theta, lin: Linearisation, free, keep):
     if not np.any(keep):
         return low, high
     sensitivity, residual = _projected(problem, lin)
-    sensitivity, unit, bread = _normal(sensitivity[:, keep])
     labels = block_labels(problem)[problem.fitted].ravel()
-    scores = np.stack([np.bincount(labels, column * residual) for column in sensitivity.T], axis=1)
-    num_blocks, num_free = len(np.unique(labels)), len(unit)
-    correction = num_blocks / max(num_blocks - num_free, 1)
-    covariance = bread @ (scores.T @ scores) @ bread * correction
-    half = stats.t.ppf(0.975, max(num_blocks - num_free, 1)) * np.sqrt(np.diag(covariance)) / unit
+    found = regress(sensitivity[:, keep], residual, labels)
+    half = stats.t.ppf(0.975, found.freedom) * np.sqrt(np.diag(found.covariance))
     centre = theta[np.asarray(free)[keep]]
     low[keep], high[keep] = centre - half, centre + half
     return low, high
-
-
-def _normal(sensitivity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return columns [M, k] of norm 1, the norms, and the inverse of their normal matrix."""
-    unit = np.linalg.norm(sensitivity, axis=0)
-    sensitivity = sensitivity / unit
-    return sensitivity, unit, np.linalg.pinv(sensitivity.T @ sensitivity)
 
 
 def count_timestep(problem: Problem, fitted: Fit) -> Fit:
@@ -276,8 +266,8 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     low, high = _interval(problem, fitted.theta, lin, fitted.free, keep)
     change = 2.0 * problem.integrator_error(fitted.theta, fitted.start, lin.residual)
     sensitivity, change = _projected(problem, lin._replace(residual=change))
-    sensitivity, unit, bread = _normal(sensitivity[:, keep])
     shift = np.zeros(len(keep))
-    shift[keep] = -bread @ (sensitivity.T @ change) / unit
+    labels = block_labels(problem)[problem.fitted].ravel()
+    shift[keep] = regress(sensitivity[:, keep], change, labels).coefficient
     low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
     return dataclasses.replace(fitted, low=low, high=high)

@@ -5,12 +5,15 @@ parameters and to the initial states come from the same batched simulation.
 """
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
+import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.segments import Segments, nearby_starts
-from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.simulate import Slot
+from garat_jax.effects import Effect
 
 BLOCK = 0.25
 """Seconds of the shortest block within which errors may be correlated, in robust variances."""
@@ -20,8 +23,39 @@ LARGE = 1e8
 """Whitened residual that stands for a simulation that diverged."""
 
 
+class Predictor(Protocol):
+    """What a fit needs of a simulator; see `simulate.Simulator`."""
+
+    @property
+    def effects(self) -> Sequence[Effect]:
+        """The effects that the parameters belong to."""
+        ...
+
+    @property
+    def slots(self) -> Sequence[Slot]:
+        """The parameters, in the order of `theta`."""
+        ...
+
+    @property
+    def base(self) -> np.ndarray:
+        """Values to begin with, [num_parameters]."""
+        ...
+
+    @property
+    def host(self) -> mujoco.MjModel:
+        """The compiled model."""
+        ...
+
+    def predict(self, theta: np.ndarray, start: np.ndarray, segments: Segments) -> np.ndarray:
+        """Predict every segment's signals, [P, S, L, num_signals]."""
+        ...
+
+
+AnySimulator = TypeVar("AnySimulator", bound=Predictor)
+
+
 @dataclasses.dataclass(frozen=True)
-class Problem:
+class Problem(Generic[AnySimulator]):
     """What is fitted to what.
 
     Attributes:
@@ -32,13 +66,13 @@ class Problem:
         interval: Seconds between samples.
     """
 
-    simulator: Simulator
-    finer: Simulator
+    simulator: AnySimulator
+    finer: AnySimulator
     segments: Segments
     fitted: np.ndarray
     interval: float
 
-    def take(self, chosen: np.ndarray) -> "Problem":
+    def take(self, chosen: np.ndarray) -> "Problem[AnySimulator]":
         """Return the problem of some of the segments."""
         segments = self.segments.take(chosen)
         return dataclasses.replace(self, segments=segments, fitted=self.fitted[chosen])
@@ -152,3 +186,8 @@ def block_labels(problem: Problem) -> np.ndarray:
     """Return a number for each block of each segment, per whitened residual, [S, N]."""
     blocks = problem.blocks()
     return np.arange(len(problem.fitted))[:, None] * (blocks.max() + 1) + blocks
+
+
+def tall(columns: np.ndarray) -> np.ndarray:
+    """Turn columns [S, N, k] into [S * N, k]."""
+    return columns.reshape(columns.shape[0] * columns.shape[1], columns.shape[2])

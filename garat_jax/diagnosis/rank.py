@@ -165,8 +165,9 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         current = count_timestep(problem, current)
     selected = tuple(_refreshed(problem, step, current) for step in steps)
     candidates = _without_superfluous(first_round, selected)
-    if steps or not is_above(problem, metric, current, floor):
-        best = current if is_above(problem, metric, current, floor) else None
+    best = current if steps else best
+    if not is_above(problem, metric, current, floor):
+        best = None
     return Outcome(before, current, candidates, tuple(steps), selected, floor.error, adequate, best)
 
 
@@ -211,8 +212,8 @@ def _with_timestep(problem: Problem, judged):
     for place, (candidate, contender) in enumerate(judged):
         if candidate.named in shown:
             fit = count_timestep(problem, contender.fit)
-            estimates = _estimates(problem, contender.score.effect, fit)
-            candidate = dataclasses.replace(candidate, parameters=estimates)
+            parameters = estimates(problem, contender.score.effect, fit)
+            candidate = dataclasses.replace(candidate, parameters=parameters)
             judged[place] = (candidate, dataclasses.replace(contender, fit=fit))
     return judged
 
@@ -250,7 +251,7 @@ def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, dr
     candidate = Candidate(
         effect=effects[contender.score.effect].kind,
         target=effects[contender.score.effect].target,
-        parameters=_estimates(problem, contender.score.effect, contender.fit),
+        parameters=estimates(problem, contender.score.effect, contender.fit),
         share=float(share),
         p_value=contender.score.p_value,
         error_after=metric.error(contender.fit.residual, held_out),
@@ -288,7 +289,7 @@ def _gain(problem, metric: Metric, before: Fit, after: Fit, held_out) -> Interva
     return Interval(float(whole[0] - whole[1]), float(low), float(high))
 
 
-def _estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate]:
+def estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate]:
     """Return the fitted parameters of an effect, and those set to another than no effect's."""
     simulator = problem.simulator
     estimates = {}
@@ -372,4 +373,4 @@ def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
 
 def _refreshed(problem: Problem, step: Step, final: Fit) -> Candidate:
     """Return a selected effect with its parameters from the final fit."""
-    return dataclasses.replace(step.candidate, parameters=_estimates(problem, step.effect, final))
+    return dataclasses.replace(step.candidate, parameters=estimates(problem, step.effect, final))

@@ -218,7 +218,10 @@ def conditions_section(diagnosis: Diagnosis) -> list[Section]:
     ]
     columns = ["condition", "effect", "parameter", "estimate", "low", "high", "unit"]
     text = "\n".join(f"- {name}: {d.sentence}" for name, d in diagnosis.conditions.items())
-    caption = "Effects of all conditions come from the base recordings; the others have them too."
+    caption = (
+        "Effects of all conditions were found in the base recordings. Where a condition has one of "
+        "them again, it acts there in its place. All sizes were fitted to all recordings together."
+    )
     return [Section("Under other conditions", text, tables=[Table(columns, rows, caption)])]
 
 

@@ -202,7 +202,8 @@ class Diagnosis:
     """Where a model fails and which effect it is missing; fields as in diagnosis.json.
 
     `conditions` holds the diagnoses of recordings made under other conditions, in which the model
-    has the effects that were selected here.
+    has the effects that were selected here; one of the same kind and place replaces it there. The
+    parameters of `selected` then fit all conditions together.
     """
 
     model: str
@@ -280,7 +281,10 @@ class Diagnosis:
             lines.append(f"  next: {self.next_experiment.how}")
         if self.verdict == "unexplained":
             lines.append(f"  or: {OFFER}")
+        shared = [c.named for c in self.selected]
         for name, found in self.conditions.items():
             lines.append(f"Under the condition {name}, with the above: {found.sentence}")
-            lines += [f"  {c.named}: {c.sizes}" for c in found.selected]
+            for c in found.selected:
+                instead = " (instead of the shared one)" if c.named in shared else ""
+                lines.append(f"  {c.named}{instead}: {c.sizes}")
         return "\n".join(lines)

@@ -22,7 +22,9 @@ from garat_jax.diagnosis.problem import (
     block_labels,
     difference_steps,
     linearise,
+    tall,
 )
+from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.simulate import Simulator
 
 EQUIVALENT = 0.95
@@ -123,7 +125,7 @@ class _Sensitivities(NamedTuple):
     labels: np.ndarray
 
 
-def screen(problem: Problem, fit: Fit, skip: Sequence[int] = ()) -> list[Score]:
+def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> list[Score]:
     """Score all candidates that are not in the model yet, largest share first.
 
     Args:
@@ -186,8 +188,9 @@ def _firsts(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], 
             if len(starts) == 1 and len(start) == 1:
                 step = _step_within(simulator, columns[0], theta[columns[0]])
                 start = {columns[0]: theta[columns[0]] + step}
+            moved = next(j for j in columns if j in start)
             trials.append(_Trial(index, start, (len(rows),), len(starts) == 1))
-            rows.append(_Row(columns[0], start, start[columns[0]] - theta[columns[0]], -1))
+            rows.append(_Row(moved, start, start[moved] - theta[moved], -1))
     return rows, trials
 
 
@@ -210,7 +213,9 @@ def _others(simulator: Simulator, theta: np.ndarray, rows: list[_Row], trials: l
         first, effect = trial.rows[0], simulator.effects[trial.effect]
         columns = [j for j, slot in enumerate(simulator.slots) if slot.effect == trial.effect]
         chosen = [first]
-        for j in columns[1:]:
+        for j in columns:
+            if j == rows[first].column:
+                continue
             base = trial.start[j] if j in trial.start else float(theta[j])
             step = _step_within(simulator, j, base)
             alone = effect.independent and len(trial.start) == 1
@@ -226,7 +231,7 @@ def _step_within(simulator: Simulator, column: int, value: float) -> float:
     return p.scale if value + p.scale <= p.high else -p.scale
 
 
-def _measure(problem: Problem, fit: Fit, start, skip):
+def _measure(problem: Problem[Simulator], fit: Fit, start, skip):
     """Simulate the candidates at all their sizes, then the other parameters of the best size.
 
     Returns:
@@ -280,16 +285,11 @@ class _Remover:
 
     def __init__(self, lin: Linearisation):
         self._space = StartSpace(lin.start)
-        self._free = _orthonormal(_tall(self._space.remove(lin.parameters)))
+        self._free = _orthonormal(tall(self._space.remove(lin.parameters)))
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         rest = self._space.remove(np.moveaxis(columns, 0, -1))
-        return _without(_tall(rest), self._free)
-
-
-def _tall(columns: np.ndarray) -> np.ndarray:
-    """Turn columns [S, N, k] into [S * N, k]."""
-    return columns.reshape(columns.shape[0] * columns.shape[1], columns.shape[2])
+        return _without(tall(rest), self._free)
 
 
 def _orthonormal(columns: np.ndarray) -> np.ndarray:
@@ -313,8 +313,9 @@ def _score(problem: Problem, s: _Sensitivities, rows: list[_Row], trial: _Trial)
     matrix = s.changes[:, chosen]
     norm = np.linalg.norm(matrix, axis=0)
     steps = np.abs([rows[i].step for i in chosen])
-    width = np.asarray([p.high - p.low for p in slots]) if trial.is_only else steps
-    seen = norm * np.maximum(width / steps, 1.0) > VISIBLE
+    width = np.asarray([p.high - p.low for p in slots])
+    is_tried = np.asarray([rows[i].column in trial.start for i in chosen]) & (not trial.is_only)
+    seen = norm * np.where(is_tried, 1.0, np.maximum(width / steps, 1.0)) > VISIBLE
     seen &= norm > 1e-3 * norm.max(initial=0.0)
     given = [k for k, i in enumerate(chosen) if rows[i].column in trial.start]
     if unseen := [slots[k].name for k in (0, *given) if not seen[k]]:
@@ -386,11 +387,8 @@ def _wald(matrix, residual, nuisance, labels) -> float:
     matrix = matrix[:, norm > 1e-6]
     if matrix.shape[1] == 0:
         return 1.0
-    bread = np.linalg.pinv(matrix.T @ matrix, rcond=1e-9)
-    factor = -bread @ (matrix.T @ residual)
-    rest = residual + matrix @ factor
-    scores = np.stack([np.bincount(labels, column * rest) for column in matrix.T], axis=1)
-    covariance = bread @ (scores.T @ scores) @ bread
-    num_blocks, num = len(np.unique(labels)), matrix.shape[1]
-    statistic = float(factor @ np.linalg.pinv(covariance) @ factor) / num
-    return float(stats.f.sf(statistic, num, max(num_blocks - num, 1)))
+    found = regress(matrix, residual, labels)
+    num = matrix.shape[1]
+    precision = np.linalg.pinv(found.covariance, hermitian=True)
+    statistic = float(found.coefficient @ precision @ found.coefficient) / num
+    return float(stats.f.sf(statistic, num, found.freedom))

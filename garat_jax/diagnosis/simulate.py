@@ -66,7 +66,14 @@ class Simulator:
         base: `theta` at which no candidate acts, [num_parameters].
     """
 
-    def __init__(self, model: Model, candidates: Sequence[Effect], grid: Grid, refine: int = 1):
+    def __init__(
+        self,
+        model: Model,
+        candidates: Sequence[Effect],
+        grid: Grid,
+        refine: int = 1,
+        acting: Sequence[int] = (),
+    ):
         """Compile the model with every candidate.
 
         Args:
@@ -74,6 +81,7 @@ class Simulator:
             candidates: The effects that may be missing, each at its nominal.
             grid: The simulated steps.
             refine: Physics substeps for each of the grid's.
+            acting: Indices of candidates that are not at their nominal, and act as they are.
         """
         timestep = Override("option", "", "timestep", grid.timestep / refine)
         model = dataclasses.replace(model, overrides=(*model.overrides, timestep))
@@ -92,6 +100,7 @@ class Simulator:
         )
         self.base = np.asarray([slot.base for slot in self.slots])
         self._owner = np.asarray([slot.effect for slot in self.slots], int)
+        self._always = {*acting}
         replayed = [effect.as_replayed() for effect in candidates]
         looking = [i for i, e in enumerate(replayed) if e.reads_state or e.notes]
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
@@ -125,7 +134,7 @@ class Simulator:
         at_once = np.asarray([self._is_at_once(row) for row in theta], bool)
         for rows in (np.flatnonzero(at_once), np.flatnonzero(~at_once)):
             if len(rows):
-                run = self._program(self._acting(theta[rows], self.base))
+                run = self._program(self._acting(theta[rows]))
                 result[rows] = self._in_batches(run, segments, theta[rows], start[rows])[0]
         return result
 
@@ -147,8 +156,8 @@ class Simulator:
             Changes of the predictions, [P, S, L, num_signals].
         """
         result = np.empty((len(theta), *segments.measured.shape))
-        acting = self._acting(base[None], self.base)
-        now, path = self._in_batches(self._program(acting), segments, base[None], start[None])
+        program = self._program(self._acting(base[None]))
+        now, path = self._in_batches(program, segments, base[None], start[None])
         for (way, _), rows in self._ways(theta, base).items():
             moved, starts = theta[rows], np.broadcast_to(start, (len(rows) + 1, *start.shape))
             if way == "stepped":
@@ -158,7 +167,7 @@ class Simulator:
                 result[rows] = self._in_batches(run, segments, moved, starts[1:])[0] - now
             else:
                 both = np.concatenate([base[None], moved])
-                run = self._along(self._acting(both, self.base))
+                run = self._along(self._acting(both))
                 changed = self._in_batches(run, segments, both, starts, path[0])[0]
                 result[rows] = changed[1:] - changed[0]
         return result
@@ -168,9 +177,9 @@ class Simulator:
         ways: dict[tuple[str, str], list[int]] = {}
         blind, memoryless = {*self._blind}, {*self._blind, *self._memoryless}
         for i, row in enumerate(theta):
-            moved = {*self._acting(row[None], base)}
+            moved = {*self._owner[row != base].tolist()}
             kinds = " ".join(sorted({self.effects[j].kind for j in moved}))
-            acting = {*self._acting(row[None], self.base)}
+            acting = {*self._acting(row[None])}
             if self._any_at_once and acting <= blind:
                 way = ("at once", "")
             elif self._any_at_once and moved <= memoryless and acting <= memoryless:
@@ -180,12 +189,13 @@ class Simulator:
             ways.setdefault(way, []).append(i)
         return ways
 
-    def _acting(self, thetas: np.ndarray, base: np.ndarray) -> tuple[int, ...]:
-        """Return the effects that some row of parameters [P, num_parameters] moves off a base."""
-        return tuple(int(i) for i in np.unique(self._owner[np.any(thetas != base, axis=0)]))
+    def _acting(self, thetas: np.ndarray) -> tuple[int, ...]:
+        """Return the effects that act under some row of parameters [P, num_parameters]."""
+        moved = self._owner[np.any(thetas != self.base, axis=0)].tolist()
+        return tuple(sorted({*moved, *self._always}))
 
     def _is_at_once(self, theta: np.ndarray) -> bool:
-        return self._any_at_once and {*self._acting(theta[None], self.base)} <= {*self._blind}
+        return self._any_at_once and {*self._acting(theta[None])} <= {*self._blind}
 
     def _program(self, chosen: tuple[int, ...]) -> Program:
         """Return the compiled program in which these candidates act."""

@@ -13,6 +13,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
 from garat_jax.diagnosis.results import Candidate
 from garat_jax.dynamics import native_model
+from garat_jax.effects import Effect
 
 HORIZONS = (0.2, 0.5, 1.0, 2.0)
 """Seconds over which errors are drawn."""
@@ -45,15 +46,19 @@ class View:
         return usable[-1] if usable else 0
 
 
-def repaired(model: Model, selected: Sequence[Candidate]) -> Model:
-    """Return a model with the effects that a diagnosis found."""
-    effects = tuple(
+def as_effects(model: Model, selected: Sequence[Candidate]) -> tuple[Effect, ...]:
+    """Return the effects that a diagnosis found, with the estimated parameters."""
+    return tuple(
         model.catalogue[c.effect](
             target=c.target, **{n: e.estimate for n, e in c.parameters.items()}
         )
         for c in selected
     )
-    return dataclasses.replace(model, effects=(*model.effects, *effects))
+
+
+def repaired(model: Model, selected: Sequence[Candidate]) -> Model:
+    """Return a model with the effects that a diagnosis found."""
+    return dataclasses.replace(model, effects=(*model.effects, *as_effects(model, selected)))
 
 
 def leftover(view: View) -> list[Place]:

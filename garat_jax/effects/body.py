@@ -14,6 +14,8 @@ from garat_jax.effects.kinematics import centre_of_mass_jacobian
 
 SMALLEST_MASS = 1e-9
 """Mass [kg] and inertia [kg m²] of the payload's body when the model is compiled."""
+PAYLOADS = (0.1, 0.5)
+"""Payloads that are tried, relative to the mass that the body carries, its own included."""
 
 
 @struct.dataclass
@@ -63,6 +65,12 @@ class PayloadMass(Effect):
         """Hang the payload at the body's centre of mass until its place is fitted."""
         place = (float(value) for value in host.body(target.partition("/")[2]).ipos)
         return {"mass": 0.0, **dict(zip("xyz", place, strict=True))}
+
+    @classmethod
+    def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
+        """Try a light and a heavy payload: the response to a heavy one is no multiple."""
+        carried = float(host.body_subtreemass[host.body(target.partition("/")[2]).id])
+        return tuple({"mass": share * max(carried, SMALLEST_MASS)} for share in PAYLOADS)
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Weld a body of negligible mass to the target, which the compiler may not fuse."""

@@ -1,56 +1,25 @@
 """What all conditions share is found once, and what one adds is that condition's own."""
 
 import dataclasses
+import functools
 
-import mujoco
-import numpy as np
 import pytest
 
 from garat_jax.cli import main
 from garat_jax.diagnosis.conditions import diagnose_conditions
-from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.effects import CATALOGUE
 from tests import models
+from tests.diagnosis.pendulum import MODEL, add_damping, add_payload, record
 
 FEW = {kind: CATALOGUE[kind] for kind in ("viscous_damping", "torque_offset", "payload_mass")}
-MODEL = Model("pendulum", __file__, __file__, models.spec(models.PENDULUM))
-TIME = np.arange(750) * 0.004
-
-
-def record(pull: float, seed: int) -> Recording:
-    """Step C MuJoCo with more damping than the model has, and with a cable that pulls [N m]."""
-    rng = np.random.default_rng(seed)
-    spec = models.spec(models.PENDULUM)
-    spec.joint("hinge").damping[0] += 0.02
-    spec.option.timestep /= 16
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    data.qpos[0] = 0.8
-    ctrl = rng.uniform(-1, 1, 8)[(TIME / 0.4).astype(int)] + 0.5 * np.sin(9 * TIME)
-    states = []
-    for command in ctrl:
-        states.append([data.qpos[0], data.qvel[0]])
-        data.ctrl[0], data.qfrc_applied[0] = command, pull
-        mujoco.mj_step(model, data, round(0.004 / model.opt.timestep))
-    states = np.asarray(states) + 1e-3 * rng.normal(size=(len(TIME), 2)) * [1.0, 10.0]
-    return Recording(
-        name=f"pull {pull}, {seed}",
-        time=TIME,
-        qpos=states[:, :1],
-        qvel=states[:, 1:],
-        ctrl=ctrl[:, None],
-        torque={},
-        velocity_measured=True,
-        spans=((0, len(TIME)),),
-        warnings=(),
-    )
 
 
 def test_damping_is_shared_and_the_pull_is_the_conditions_own():
     model = dataclasses.replace(MODEL, catalogue=FEW)
-    base = [record(0.0, seed) for seed in range(3)]
-    found = diagnose_conditions(model, base, {"with cable": [record(0.1, s) for s in (3, 4, 5)]})
+    base = [record(add_damping, seed) for seed in range(3)]
+    pulled = [record(add_damping, seed, pull=0.1) for seed in (3, 4, 5)]
+    found = diagnose_conditions(model, base, {"with cable": pulled})
     (damping,) = found.selected
     assert damping.effect == "viscous_damping"
     assert damping.parameters["coefficient"].estimate == pytest.approx(0.02, rel=0.05)
@@ -61,6 +30,37 @@ def test_damping_is_shared_and_the_pull_is_the_conditions_own():
     assert content["selected"][0]["effect"] == "torque_offset"
     assert content["conditions"] == {}
     assert "Under the condition with cable, with the above: Missing: torque_offset" in str(found)
+
+
+def test_a_shared_effect_may_be_weaker_under_a_condition():
+    model = dataclasses.replace(MODEL, catalogue=FEW)
+    base = [record(add_damping, seed) for seed in range(3)]
+    weaker = functools.partial(add_damping, size=0.008)
+    found = diagnose_conditions(model, base, {"warm": [record(weaker, s) for s in (3, 4, 5)]})
+    (cold,), (warm,) = found.selected, found.conditions["warm"].selected
+    assert cold.named == warm.named
+    assert cold.parameters["coefficient"].estimate == pytest.approx(0.02, rel=0.05)
+    assert warm.parameters["coefficient"].estimate == pytest.approx(0.008, rel=0.05)
+    assert "viscous_damping at joint/hinge (instead of the shared one): coeff" in str(found)
+
+
+def test_all_conditions_size_a_shared_effect_and_each_sizes_its_own():
+    model = dataclasses.replace(MODEL, catalogue=FEW)
+
+    def loaded(spec):
+        add_damping(spec)
+        add_payload(spec, mass=0.1, x=0.0, z=-0.4)
+
+    base = [record(add_damping, seed) for seed in range(3)]
+    found = diagnose_conditions(model, base, {"loaded": [record(loaded, s) for s in (3, 4, 5)]})
+    alone = diagnose(model, base)
+    (payload,) = found.conditions["loaded"].selected
+    assert payload.effect == "payload_mass"
+    assert payload.parameters["mass"].estimate == pytest.approx(0.1, rel=0.05)
+    assert payload.parameters["z"].estimate == pytest.approx(-0.4, abs=0.01)
+    before, after = (d.selected[0].parameters["coefficient"] for d in (alone, found))
+    assert after.estimate != before.estimate
+    assert after.low < 0.02 < after.high
 
 
 def test_a_condition_without_a_file_is_refused(tmp_path, capsys):
