@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,39 +42,21 @@ def make(env: Env, config: TRPOConfig) -> Agent:
     policy_net = GaussianPolicy(env.action_size, config.hidden, config.initial_log_std)
     value_net = ValueNet(config.hidden)
     policy, mean = actor_critic.make_policy(policy_net)
-    optimiser = optax.adam(config.value_learning_rate)
 
     def init(key: jax.Array, env_params: Params) -> ActorCriticState:
         state = actor_critic.init_state(
             env, env_params, policy_net, value_net, key, config.num_envs
         )
-        return state._replace(optimiser=optimiser.init(state.value))
-
-    def value_step(carry, batch: Batch):
-        weights, optimiser_state = carry
-
-        def loss(weights):
-            error = forward(value_net, weights, batch.obs) - batch.value_target
-            return jnp.mean(jnp.square(error))
-
-        value_loss, grads = jax.value_and_grad(loss)(weights)
-        updates, optimiser_state = optimiser.update(grads, optimiser_state)
-        return (optax.apply_updates(weights, updates), optimiser_state), value_loss
+        return state._replace(optimiser=value_optimiser(config).init(state.value))
 
     def step(state: ActorCriticState, env_params: Params):
         state, transitions = actor_critic.collect(env, env_params, policy, state, config.num_steps)
         batch = actor_critic.prepare(value_net, state, transitions, config.discount, config.trace)
         weights, metrics = policy_step(policy_net, state.policy.weights, batch, config)
 
-        def epoch(carry, key):
-            number = batch.action.shape[0] // config.value_minibatch
-            return jax.lax.scan(value_step, carry, actor_critic.minibatches(batch, key, number))
-
         key, value_key = jax.random.split(state.key)
-        (value, optimiser_state), value_loss = jax.lax.scan(
-            epoch,
-            (state.value, state.optimiser),
-            jax.random.split(value_key, config.value_epochs),
+        value, optimiser_state, value_loss = fit_value(
+            value_net, state.value, state.optimiser, batch, value_key, config
         )
         state = state._replace(
             policy=state.policy._replace(weights=weights),
@@ -82,10 +65,60 @@ def make(env: Env, config: TRPOConfig) -> Agent:
             key=key,
         )
         metrics = metrics | actor_critic.episode_metrics(state, transitions)
-        metrics["value_loss"] = value_loss.mean()
+        metrics["value_loss"] = value_loss
         return actor_critic.observe(state, transitions), metrics, transitions
 
     return Agent(init, step, policy, mean, config.num_envs * config.num_steps)
+
+
+def value_optimiser(config: TRPOConfig) -> optax.GradientTransformation:
+    """Return what fits the value network."""
+    return optax.adam(config.value_learning_rate)
+
+
+def fit_value(
+    network: ValueNet,
+    weights: Params,
+    optimiser_state: optax.OptState,
+    batch: Batch,
+    key: jax.Array,
+    config: TRPOConfig,
+) -> tuple[Params, optax.OptState, jax.Array]:
+    """Fit the value network to a batch's targets.
+
+    Args:
+        network: The value network.
+        weights: Its weights.
+        optimiser_state: State of `value_optimiser`.
+        batch: Experience, [N].
+        key: PRNG key.
+        config: Epochs and size of the minibatches.
+
+    Returns:
+        The new weights, the optimiser's state and the mean loss on the way, [].
+    """
+    optimiser = value_optimiser(config)
+
+    def minibatch_step(carry, batch: Batch):
+        weights, optimiser_state = carry
+
+        def loss(weights):
+            error = forward(network, weights, batch.obs) - batch.value_target
+            return jnp.mean(jnp.square(error))
+
+        value_loss, grads = jax.value_and_grad(loss)(weights)
+        updates, optimiser_state = optimiser.update(grads, optimiser_state)
+        return (optax.apply_updates(weights, updates), optimiser_state), value_loss
+
+    def epoch(carry, key):
+        number = batch.action.shape[0] // config.value_minibatch
+        minibatches = actor_critic.minibatches(batch, key, number)
+        return jax.lax.scan(minibatch_step, carry, minibatches)
+
+    keys = jax.random.split(key, config.value_epochs)
+    carry: Any = (weights, optimiser_state)
+    (weights, optimiser_state), losses = jax.lax.scan(epoch, carry, keys)
+    return weights, optimiser_state, losses.mean()
 
 
 def policy_step(
