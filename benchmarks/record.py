@@ -19,6 +19,7 @@ def write_result(
     *,
     seeds: Sequence[int],
     command: str,
+    details: Mapping[str, Any] | None = None,
     folder: Path = RESULTS,
 ) -> Path:
     """Write one benchmark's rows to `results/<name>.json`.
@@ -28,6 +29,7 @@ def write_result(
         rows: One mapping a row of the table or a point of the figure.
         seeds: The seeds that the rows come from.
         command: The command line that makes the rows again, from the root of the repository.
+        details: What else the file holds, by name: how the rows were chosen, or what explains them.
         folder: Where the file goes.
 
     Returns:
@@ -45,6 +47,7 @@ def write_result(
         "seeds": list(seeds),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         **provenance(),
+        **(details or {}),
         "rows": rows,
     }
     text = json.dumps(to_plain(result), indent=2, allow_nan=False) + "\n"

@@ -1,190 +1,146 @@
-"""Measure environment steps a second with learning in them, beside what the physics alone gives.
+"""Measure environment steps a second with learning in them, beside other libraries and the engine.
 
-`python benchmarks/throughput.py`: an iteration of TRPO and of PPO with the presets' settings, and
-the same number of steps of the same environments with random actions, compiled first and then run
-in turns.
+`python benchmarks/throughput.py`: iterations of TRPO and of PPO with the presets' settings; the
+same steps with random actions; C MuJoCo alone; and other libraries' TRPO and PPO with the same
+hyper-parameters in the same worlds. All are compiled and warm, and run in turns.
 """
 
 import dataclasses
 import os
-import time
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 import tyro
-from record import write_result
+from record import RESULTS, write_result
+from speed import ours
+from speed.ours import Size
+from speed.parts import parts
+from speed.sides import RANDOM, Side, measure, with_ratios
 
-from garat_jax import rollout
-from garat_jax.agents import ppo, trpo
-from garat_jax.agents.ppo import PPOConfig
-from garat_jax.agents.trpo import TRPOConfig
-from garat_jax.compiler_options import compiler_options
-from garat_jax.env import Env, World, make_world
+from garat_jax.env import World, make_world
 from garat_jax.envs import ENVS
 from garat_jax.errors import choose
-from garat_jax.types import Agent
+
+ITERATIONS = 5
+"""Iterations in a timed run."""
+EXTRA = "pip install garat_jax[bench]"
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Measure environment steps a second including learning."""
 
-    env: str = "inverted_pendulum"
-    """The environment."""
+    envs: tuple[str, ...] = ("inverted_pendulum", "hopper", "half_cheetah", "walker2d")
+    """The environments."""
     repetitions: int = 5
-    """Timed runs of each program; the median counts."""
+    """Timed runs of each side; the median counts."""
+    engine: str = "auto"
+    """Physics of the JAX sides."""
+    mjx: tuple[str, ...] = ("inverted_pendulum",)
+    """Environments that are stepped with MJX too."""
+    peers: bool = True
+    """Other libraries as well."""
+    out: Path = RESULTS
+    """Folder for the results."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Size:
-    """How much one engine has to do: MJX on a CPU is slow, and gets less."""
-
-    engine: str
-    num_seeds: tuple[int, ...]
-    num_envs: int
-    num_steps: int
-
-
-SIZES = (Size("mujoco", (1, 5), 50, 100), Size("mjx", (1,), 50, 20))
-"""50 environments and 100 steps a batch are the presets'."""
-ITERATIONS = 5
-"""Iterations in a timed run."""
+def own_sides(name: str, world: World, mjx: World | None) -> list[Side]:
+    """Compile our sides; 50 environments and 100 steps a batch are the presets'."""
+    sides = []
+    for num_seeds, num_envs, num_steps in ((1, 50, 100), (5, 50, 100), (1, 250, 20)):
+        size = Size(num_seeds, num_envs, num_steps, ITERATIONS)
+        if world.params.engine == "mujoco":
+            sides.append(ours.engine_alone(name, world, size))
+        sides += [ours.make_side(agent, name, world, size) for agent in (RANDOM, "trpo", "ppo")]
+    if mjx is not None and world.params.engine != "mjx":
+        size = Size(1, 50, 20, ITERATIONS)  # MJX on a CPU is slow, and gets less
+        sides += [ours.make_side(agent, name, mjx, size) for agent in (RANDOM, "trpo", "ppo")]
+    return sides
 
 
-class Program(NamedTuple):
-    """A compiled program that goes from a state to the next, and what to report of it."""
+def peer_sides(name: str, world: World) -> tuple[list[Side], list[dict[str, Any]]]:
+    """Return other libraries' sides, and what their choices gave; say which are not installed."""
+    sides, tried = [], []
+    try:
+        from speed import torch_peers
+    except ModuleNotFoundError as error:
+        skip("stable-baselines3 and sb3-contrib", error)
+    else:
+        host = make_world(world.env.task, engine="mujoco")
+        sides, tried = torch_peers.sides(name, host, ("trpo", "ppo"), ITERATIONS)
+    from speed import jax_peers
 
-    row: dict[str, Any]
-    step: Callable[[Any], Any]
-    state: Any
-    env_steps: int
-
-
-def random_agent(env: Env, num_envs: int, num_steps: int) -> Agent:
-    """Return an agent that acts at random and never learns."""
-    low, high = jnp.asarray(env.action_low), jnp.asarray(env.action_high)
-
-    def policy(params, obs: jax.Array, key: jax.Array):
-        del params, obs
-        return jax.random.uniform(key, low.shape, minval=low, maxval=high), jnp.zeros(())
-
-    def init(key: jax.Array, env_params):
-        reset_key, key = jax.random.split(key)
-        return rollout.reset(env, env_params, reset_key, num_envs), key
-
-    def step(state, env_params):
-        env_state, key = state
-        key, unroll_key = jax.random.split(key)
-        env_state, transitions, _ = rollout.unroll(
-            env, env_params, policy, (), env_state, unroll_key, num_steps
-        )
-        return (env_state, key), {"reward": transitions.reward.mean()}, transitions
-
-    return Agent(init, step, policy, lambda params, obs: low, num_envs * num_steps)
+    sides.append(jax_peers.brax_side(name, world, ITERATIONS))
+    try:
+        sides.append(jax_peers.rejax_side(name, world, ITERATIONS))
+    except ModuleNotFoundError as error:
+        skip("rejax", error)
+    return sides, tried
 
 
-def make_agents(env: Env, size: Size) -> dict[str, Agent]:
-    num_envs, num_steps = size.num_envs, size.num_steps
-    return {
-        "random actions": random_agent(env, num_envs, num_steps),
-        "trpo": trpo.make(env, TRPOConfig(num_envs, num_steps)),
-        "ppo": ppo.make(env, PPOConfig(num_envs, num_steps)),
-    }
+def skip(peer: str, error: ModuleNotFoundError) -> None:
+    print(f"{peer}: left out, {error.name} is not installed; it comes with {EXTRA}", flush=True)
 
 
-def make_program(name: str, agent: Agent, world: World, size: Size, num_seeds: int) -> Program:
-    """Compile an agent's iteration for a number of seeds, and take one to warm up."""
-    options = compiler_options(world.params)
-    keys = jax.vmap(jax.random.key)(jnp.arange(num_seeds))
-    state = jax.jit(jax.vmap(agent.init, (0, None)), compiler_options=options)(keys, world.params)
-
-    def iterate(state):
-        state, metrics, _ = jax.vmap(agent.step, (0, None))(state, world.params)
-        return state, metrics
-
-    started, busy = time.perf_counter(), time.process_time()
-    compiled = jax.jit(iterate, compiler_options=options).lower(state).compile()
-    seconds, busy = time.perf_counter() - started, time.process_time() - busy
-    row = {
-        "engine": size.engine,
-        "agent": name,
-        "seeds": num_seeds,
-        "envs": size.num_envs,
-        "steps": size.num_steps,
-        "compile_seconds": seconds,
-        "compile_processor_seconds": busy,
-    }
-    state = jax.block_until_ready(compiled(state))[0]
-    return Program(row, compiled, state, num_seeds * agent.steps_per_iteration)
-
-
-def measure(programs: list[Program], repetitions: int) -> list[dict[str, Any]]:
-    """Run the programs in turns; return their rows with medians and the share of the raw rate."""
-    states = [program.state for program in programs]
-    seconds, busy = np.zeros((2, repetitions, len(programs)))
-    for repetition in range(repetitions):
-        for number, program in enumerate(programs):
-            started, used = time.perf_counter(), time.process_time()
-            for _ in range(ITERATIONS):
-                states[number] = program.step(states[number])[0]
-            jax.block_until_ready(states[number])
-            seconds[repetition, number] = time.perf_counter() - started
-            busy[repetition, number] = time.process_time() - used
-    steps = ITERATIONS * np.asarray([program.env_steps for program in programs])
-    rates = steps / np.median(seconds, axis=0)
-    by_processors = steps / np.median(busy, axis=0)
-    raw = {
-        (p.row["engine"], p.row["seeds"]): rate
-        for p, rate in zip(programs, rates, strict=True)
-        if p.row["agent"] == "random actions"
-    }
-    return [
-        program.row
-        | {
-            "steps_per_second": rate,
-            "steps_per_processor_second": by_processor,
-            "slowest": count / taken.max(),
-            "fastest": count / taken.min(),
-            "share_of_random_actions": rate / raw[program.row["engine"], program.row["seeds"]],
-        }
-        for program, rate, by_processor, count, taken in zip(
-            programs, rates, by_processors, steps, seconds.T, strict=True
-        )
+def measure_world(name: str, arguments: Arguments) -> tuple[list[dict], list[dict], list[dict]]:
+    """Return a world's rows, what the peers' choices gave, and the parts of an iteration."""
+    task = choose("environment", name, ENVS)()
+    world = make_world(task, engine=arguments.engine)
+    mjx = make_world(task, engine="mjx") if name in arguments.mjx else None
+    busy = os.getloadavg()[0]
+    own = own_sides(name, world, mjx)
+    others, tried = peer_sides(name, world) if arguments.peers else ([], [])
+    rows = with_ratios(measure([*own, *others], arguments.repetitions))
+    for side in (*own, *others):
+        side.close()
+    costs = [
+        parts(name, world, Size(num_seeds, 50, 100, 1), arguments.repetitions)
+        for num_seeds in (1, 5)
     ]
+    rows = [row | {"load_average_before": busy} for row in rows]
+    for row in rows:
+        show(row)
+    return rows, tried, costs
+
+
+def show(row: dict[str, Any]) -> None:
+    ratio = row.get("ours_over_this")
+    share = row.get("share_of_random_actions")
+    print(
+        f"{row['env']:18} {row['agent']:23} {row['engine']:7} seeds {row['seeds']} envs "
+        f"{row['envs']:3} {row['steps_per_second']:9,.0f} steps/s "
+        f"{row['steps_per_processor_second']:9,.0f} a processor second"
+        + (f", {share:.2f} of random actions'" if share else "")
+        + (f"; ours is {ratio:.1f} times as fast" if ratio else ""),
+        flush=True,
+    )
 
 
 def main() -> None:
     arguments = tyro.cli(Arguments)
-    task = choose("environment", arguments.env, ENVS)()
-    programs = []
-    for size in SIZES:
-        world = make_world(task, engine=size.engine)
-        programs += [
-            make_program(name, agent, world, size, num_seeds)
-            for num_seeds in size.num_seeds
-            for name, agent in make_agents(world.env, size).items()
-        ]
-    busy = os.getloadavg()[0]
-    rows = [
-        {"env": arguments.env, **row, "load_average_before": busy}
-        for row in measure(programs, arguments.repetitions)
-    ]
-    for row in rows:
-        print(
-            f"{row['engine']:7} {row['agent']:15} seeds {row['seeds']}"
-            f"{row['steps_per_second']:10,.0f} steps/s, "
-            f"{row['steps_per_processor_second']:10,.0f} a processor second, "
-            f"{row['share_of_random_actions']:.2f} of the random actions', compiled in "
-            f"{row['compile_processor_seconds']:.1f} processor seconds"
-        )
+    rows, tried, costs = [], [], []
+    for name in arguments.envs:
+        for found, more in zip((rows, tried, costs), measure_world(name, arguments), strict=True):
+            found += more
+    backend = jax.default_backend()
+    name = "throughput" if backend == "cpu" else f"throughput_{backend}"
     command = (
-        f"python benchmarks/throughput.py --env {arguments.env} "
+        f"python benchmarks/throughput.py --envs {' '.join(arguments.envs)} "
         f"--repetitions {arguments.repetitions}"
     )
-    print(write_result("throughput", rows, seeds=list(range(5)), command=command))
+    details = {
+        "device": jax.devices()[0].device_kind,
+        "load_average_after": os.getloadavg(),
+        "choices_of_the_peers": tried,
+        "parts_of_a_trpo_iteration": costs,
+    }
+    seeds = list(range(5))
+    print(
+        write_result(
+            name, rows, seeds=seeds, command=command, details=details, folder=arguments.out
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -5,17 +5,16 @@
 """
 
 import dataclasses
-import json
 import re
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import speed_tables
 import tyro
+from results import ROOT, origin, read, table
 
-ROOT = Path(__file__).resolve().parent.parent.parent
 BLOCK = re.compile(r"(<!-- table (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -25,24 +24,6 @@ class Arguments:
 
     check: bool = False
     """Change nothing; exit with 1 if a table is not what its result file gives."""
-
-
-def read(name: str) -> dict[str, Any]:
-    return json.loads((ROOT / "benchmarks/results" / f"{name}.json").read_text(encoding="utf-8"))
-
-
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    marks = ["---", *["---:"] * (len(columns) - 1)]
-    return "".join(f"| {' | '.join(row)} |\n" for row in (columns, marks, *rows))
-
-
-def origin(name: str, result: dict[str, Any]) -> str:
-    """Say where a table comes from."""
-    machine = result["machine"]
-    return (
-        f"\n`{result['command']}` → `benchmarks/results/{name}.json` "
-        f"(commit {result['git']['commit'][:7]}, {machine['cores']} cores of an {machine['cpu']})\n"
-    )
 
 
 def spread(scaled: dict[str, Any]) -> str:
@@ -101,24 +82,6 @@ def variants() -> str:
     return table(columns, rows) + origin("grounding_variants", result)
 
 
-def throughput() -> str:
-    result = read("throughput")
-    rows = [
-        (
-            row["agent"],
-            {"mujoco": "C MuJoCo", "mjx": "MJX"}[row["engine"]],
-            str(row["seeds"]),
-            f"{row['steps_per_second']:,.0f}",
-            f"{row['steps_per_processor_second']:,.0f}",
-            f"{row['share_of_random_actions']:.2f}",
-            f"{row['compile_processor_seconds']:.1f}",
-        )
-        for row in result["rows"]
-    ]
-    columns = ("", "engine", "seeds", "steps/s", "a processor second", "share", "compilation [s]")
-    return table(columns, rows) + origin("throughput", result)
-
-
 def flags() -> str:
     result = read("xla_flags")
     emitters = {True: "on (XLA's default)", False: "off", None: "–"}
@@ -175,7 +138,11 @@ def ground() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "transfer": transfer,
     "variants": variants,
-    "throughput": throughput,
+    "throughput": speed_tables.throughput,
+    "parts": speed_tables.parts,
+    "growth": speed_tables.growth,
+    "seeds_together": speed_tables.seeds_together,
+    "memory": speed_tables.memory,
     "flags": flags,
     "real_data": real_data,
     "ground": ground,

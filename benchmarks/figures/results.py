@@ -1,0 +1,30 @@
+"""Result files, and tables made of them."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+
+
+def exists(name: str) -> bool:
+    return (ROOT / "benchmarks/results" / f"{name}.json").is_file()
+
+
+def read(name: str) -> dict[str, Any]:
+    return json.loads((ROOT / "benchmarks/results" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    marks = ["---", *["---:"] * (len(columns) - 1)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in (columns, marks, *rows))
+
+
+def origin(name: str, result: dict[str, Any]) -> str:
+    """Say where a table comes from."""
+    machine = result["machine"]
+    return (
+        f"\n`{result['command']}` → `benchmarks/results/{name}.json` "
+        f"(commit {result['git']['commit'][:7]}, {machine['cores']} cores of an {machine['cpu']})\n"
+    )

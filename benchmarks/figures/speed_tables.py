@@ -1,0 +1,150 @@
+"""The tables of docs/performance.md on learning: beside others, by parts, growing, together."""
+
+from collections.abc import Callable
+from typing import Any
+
+from results import ROOT, exists, origin, read, table
+
+WORLDS = {
+    "inverted_pendulum": "InvertedPendulum",
+    "hopper": "Hopper",
+    "half_cheetah": "HalfCheetah",
+    "walker2d": "Walker2d",
+    "ant": "Ant",
+    "minitaur": "Minitaur",
+}
+"""Names of environments, in the order of the columns."""
+ALGORITHMS = {"trpo": "TRPO", "ppo": "PPO"}
+PARTS = {
+    "rollout": "rollout",
+    "advantages": "advantages",
+    "policy": "policy's step",
+    "direction": "of that, Fisher products",
+    "value": "value fit",
+    "statistics": "statistics",
+}
+
+
+def if_measured(make: Callable[[dict[str, Any]], str], name: str, part: str = "rows") -> str:
+    """Return a table with its origin, or that a file or this part of it is not there yet."""
+    if exists(name) and part in (result := read(name)):
+        return make(result) + origin(name, result)
+    return f"Not measured yet: `python benchmarks/{name}.py`.\n"
+
+
+def throughput() -> str:
+    return if_measured(_throughput, "throughput")
+
+
+def _throughput(result: dict[str, Any]) -> str:
+    """One row a side and one column a world: steps/s, and in brackets what it is compared with."""
+    rows = result["rows"]
+    worlds = [name for name in WORLDS if any(row["env"] == name for row in rows)]
+    cells: dict[str, dict[str, str]] = {}
+    for row in rows:
+        cells.setdefault(_side(row), {})[row["env"]] = _rate(row)
+    lines = [(side, *(found.get(name, "") for name in worlds)) for side, found in cells.items()]
+    return table(("steps/s", *(WORLDS[name] for name in worlds)), lines)
+
+
+def _side(row: dict[str, Any]) -> str:
+    """Name a row's side."""
+    library, _, algorithm = row["agent"].rpartition(" ")
+    if "version" in row:
+        name = f"{library} {ALGORITHMS[algorithm]}"
+        return f"{name} in Gymnasium's own world" if row.get("stepped") == OWN else name
+    name = ALGORITHMS.get(row["agent"], row["agent"])
+    if row["agent"] in ALGORITHMS:
+        name = f"**{name}**"
+    seeds = "" if row["seeds"] == 1 else f", {row['seeds']} seeds"
+    envs = "" if row["envs"] == PRESET_ENVS else f", {row['envs']} environments"
+    return f"{name}{seeds}{envs}{', MJX' if row['engine'] == 'mjx' else ''}"
+
+
+FIGURE = "figures/growth.svg"
+"""What figures/growth.py draws, seen from docs/."""
+PRESET_ENVS = 50
+OWN = "Gymnasium's own"
+"""How `torch_peers.py` calls it."""
+
+
+def _rate(row: dict[str, Any]) -> str:
+    rate = f"{row['steps_per_second']:,.0f}"
+    if "ours_over_this" in row:
+        return f"{rate} (× {row['ours_over_this']:.1f})"
+    if row["agent"] in ALGORITHMS:
+        return f"{rate} ({100 * row['share_of_random_actions']:.0f} %)"
+    return rate
+
+
+def parts() -> str:
+    return if_measured(_parts, "throughput", "parts_of_a_trpo_iteration")
+
+
+def _parts(result: dict[str, Any]) -> str:
+    """One row a world and number of seeds: what each part of an iteration of TRPO takes."""
+    costs = result["parts_of_a_trpo_iteration"]
+    rows = [
+        (
+            f"{WORLDS[cost['env']]}, {cost['seeds']} seed{'s' if cost['seeds'] > 1 else ''}",
+            *(f"{1e3 * cost['seconds'][part]:.1f}" for part in PARTS),
+            f"{1e3 * cost['seconds']['iteration']:.0f}",
+        )
+        for cost in costs
+    ]
+    return table(("ms in an iteration", *PARTS.values(), "whole iteration"), rows)
+
+
+def growth() -> str:
+    return if_measured(_growth, "growth")
+
+
+def _growth(result: dict[str, Any]) -> str:
+    """One row a world and one column a size: steps/s of TRPO, and of random actions below it."""
+    rows = result["rows"]
+    text = ""
+    if (ROOT / "docs" / FIGURE).is_file():
+        text = f"![Steps a second against environments and against seeds]({FIGURE})\n\n"
+    for grows, what in (("envs", "environments"), ("seeds", "seeds of 50 environments")):
+        chosen = [row for row in rows if row["grows"] == grows]
+        sizes = sorted({row[grows] for row in chosen})
+        lines = []
+        for name in dict.fromkeys(row["env"] for row in chosen):
+            for agent in ("trpo", "random actions"):
+                found = {
+                    row[grows]: f"{row['steps_per_second']:,.0f}"
+                    for row in chosen
+                    if row["env"] == name and row["agent"] == agent
+                }
+                side = f"{WORLDS[name]}, {ALGORITHMS.get(agent, agent)}"
+                lines.append((side, *(found.get(size, "") for size in sizes)))
+        text += table((f"steps/s, {what}:", *(f"{size:,}" for size in sizes)), lines) + "\n"
+    return text.rstrip("\n") + "\n"
+
+
+def seeds_together() -> str:
+    return if_measured(_seeds_together, "seeds_together")
+
+
+def _seeds_together(result: dict[str, Any]) -> str:
+    rows = [
+        (
+            f"{WORLDS[row['env']]}, {row['seeds']} × {row['steps_of_each']:,} steps",
+            row["cache"],
+            f"{row['together_seconds']:.0f}",
+            f"{row['one_after_another_seconds']:.0f}",
+            f"{row['ratio']:.2f}",
+        )
+        for row in result["rows"]
+    ]
+    columns = ("", "compilation cache", "together [s]", "one after another [s]", "ratio")
+    return table(columns, rows)
+
+
+def memory() -> str:
+    return if_measured(_memory, "memory")
+
+
+def _memory(result: dict[str, Any]) -> str:
+    rows = [(row["pair"], f"{row['peak_mebibytes']:,.0f}") for row in result["rows"]]
+    return table((f"{result['rows'][0]['seeds']} seeds", "most memory [MiB]"), rows)
