@@ -122,6 +122,7 @@ def make_trpo(envs: VecEnv) -> TRPO:
         gae_lambda=config.trace,
         cg_max_steps=config.cg_iterations,
         cg_damping=config.cg_damping,
+        sub_sampling_factor=round(1 / config.fisher_share),
         line_search_shrinking_factor=0.5,
         line_search_max_iter=config.line_search_steps,
         n_critic_updates=config.value_epochs,

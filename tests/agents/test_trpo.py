@@ -14,7 +14,7 @@ from garat_jax.agents.trpo import TRPOConfig
 from garat_jax.networks import GaussianPolicy, forward
 
 NETWORK = GaussianPolicy(size=2, hidden=(5,), initial_log_std=-0.5)
-CONFIG = TRPOConfig()
+CONFIG = TRPOConfig(fisher_share=1.0)
 policy_step = jax.jit(functools.partial(trpo.policy_step, NETWORK), static_argnames="config")
 
 
@@ -95,7 +95,7 @@ def test_a_step_improves_the_surrogate_within_the_trust_region(seed):
 def test_the_step_is_the_natural_gradient_of_the_trust_region_length():
     weights, batch = weights_and_batch()
     flat, unflatten = ravel_pytree(weights)
-    config = TRPOConfig(cg_iterations=200)
+    config = TRPOConfig(cg_iterations=200, fisher_share=1.0)
     new, metrics = policy_step(weights, batch, config=config)
     gradient = jax.grad(lambda x: surrogate(unflatten(x), batch))(flat)
     hessian = kl_hessian(weights, batch.obs)
