@@ -5,10 +5,14 @@ to its cache. Here a program holds the function's name instead. XLA hands the ca
 through its C interface for foreign functions, and the handler looks the name up among the functions
 that this process traced. The handler is made with ctypes: nothing has to be compiled.
 
+The call is declared to have a side effect, though it has none. XLA runs programs on threads of its
+own, and one that is still under way when the interpreter ends would enter Python through the
+handler: such processes crashed or hung. JAX keeps a token of each program with an effect, and at
+exit it waits for them before anything is torn down.
+
 The structures below are those of xla/ffi/api/c_api.h, which comes with jaxlib, as of version 0.1 of
-that interface. Where XLA does not take the handler, on accelerators, and with several CPU devices
-(where processes that had called the handler crashed at their end), `jax.pure_callback` serves, and
-the program is compiled at every start.
+that interface. Where XLA does not take the handler, and on accelerators, `jax.pure_callback`
+serves, and the program is compiled at every start.
 """
 
 import ctypes
@@ -51,7 +55,7 @@ def call(name: str, function: HostFunction, size: int, inputs: Sequence[jax.Arra
         The result's 32-bit words, [size].
     """
     shape = jax.ShapeDtypeStruct((size,), jnp.uint32)
-    if jax.default_backend() != "cpu" or jax.local_device_count() > 1 or not _is_registered():
+    if jax.default_backend() != "cpu" or not _is_registered():
         return jax.pure_callback(
             lambda *arrays: function([np.asarray(array) for array in arrays]),
             shape,
@@ -59,7 +63,8 @@ def call(name: str, function: HostFunction, size: int, inputs: Sequence[jax.Arra
             vmap_method="expand_dims",
         )
     _functions[name] = function
-    return jax.ffi.ffi_call(TARGET, shape, vmap_method="expand_dims")(*inputs, function=name)
+    called = jax.ffi.ffi_call(TARGET, shape, vmap_method="expand_dims", has_side_effect=True)
+    return called(*inputs, function=name)
 
 
 class _Extension(ctypes.Structure):

@@ -1,5 +1,9 @@
 """Python functions in compiled programs: called by name, kept by the compilation cache."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,6 +58,37 @@ def test_both_ways_give_the_same(platform, monkeypatch):
     program = jax.jit(lambda x: call(f"on {platform}", add, 4, x, x))
     assert ("callback" in program.lower(x).as_text()) == (platform != "cpu")
     np.testing.assert_array_equal(program(x), 2 * np.arange(4))
+
+
+LEFT_UNDER_WAY = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, PartitionSpec as P
+from garat_jax import host_call
+
+def run(x):
+    def step(x, _):
+        return jax.vmap(lambda row: host_call.call("add", sum, 3, [row, row]))(x), None
+    return jax.lax.scan(step, x, length=2000)[0]
+
+mesh = Mesh(np.asarray(jax.devices()), ("devices",))
+split = P("devices")
+program = jax.shard_map(run, mesh=mesh, in_specs=split, out_specs=split, check_vma=False)
+result = jax.jit(program)(jnp.ones((8, 3), jnp.uint32))
+print(len(jax.devices()), result.is_ready())
+"""
+
+
+def test_a_process_may_end_while_its_programs_are_under_way():
+    flag = "--xla_force_host_platform_device_count=4"
+    process = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", LEFT_UNDER_WAY],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "XLA_FLAGS": flag},
+        timeout=120,
+    )
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.split() == ["4", "False"]
 
 
 def step_program():
