@@ -3,10 +3,9 @@
 from collections.abc import Callable
 
 from garat_jax.agents.ppo import PPOConfig
-from garat_jax.ground import GroundConfig
 from garat_jax.methods.garat import GARATConfig
 from garat_jax.methods.gat import GATConfig
-from garat_jax.transfer import Pair, TransferConfig
+from garat_jax.transfer import GroundConfig, Pair, TransferConfig
 
 
 def garat(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferConfig:

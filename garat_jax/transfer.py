@@ -82,6 +82,33 @@ class TransferConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class GroundConfig:
+    """Settings of grounding on measurements; presets give tuned ones.
+
+    Attributes:
+        method: Its name.
+        learner: Its settings.
+        num_updates: Of the action transformer.
+        num_transitions: Most recorded control steps that it learns from, drawn at random.
+        num_held_out: Most held-out control steps that the transition error is measured on.
+        episode: Seconds that a rollout in the source goes on from a recorded state.
+    """
+
+    method: str
+    learner: GARATConfig | GATConfig
+    num_updates: int
+    num_transitions: int = 5000  # Desai et al. 2020
+    num_held_out: int = 2000
+    episode: float = 0.5
+
+    def reaching(self, reach: float) -> GARATConfig | GATConfig:
+        """Return the learner's settings, GARAT's with a reach in half-ranges of the action."""
+        if isinstance(self.learner, GATConfig):
+            return self.learner
+        return dataclasses.replace(self.learner, reach=reach)
+
+
+@dataclasses.dataclass(frozen=True)
 class Worlds:
     """The two worlds and the agent that lives in them."""
 

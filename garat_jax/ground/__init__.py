@@ -6,6 +6,7 @@ recordings alone. What is learned is an action transformer.
 
 from garat_jax.ground.learn import Grounded, ground
 from garat_jax.ground.run import run_ground
-from garat_jax.ground.source import GroundConfig, load_grounded
+from garat_jax.ground.source import load_grounded
+from garat_jax.transfer import GroundConfig
 
 __all__ = ["GroundConfig", "Grounded", "ground", "load_grounded", "run_ground"]

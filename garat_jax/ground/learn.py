@@ -15,7 +15,7 @@ from garat_jax.diagnosis.diagnose import split
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.dynamics import Dynamics
-from garat_jax.ground.source import TRANSFORMER, GroundConfig, make_source, with_transformer
+from garat_jax.ground.source import TRANSFORMER, make_source, with_transformer
 from garat_jax.ground.steps import choose_bounds, control_steps, draw
 from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.grounded import GroundedEnv, Grounding
@@ -32,7 +32,7 @@ from garat_jax.methods.recorded import (
 from garat_jax.methods.transition_error import transition_error
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer
-from garat_jax.transfer import make_method
+from garat_jax.transfer import GroundConfig, make_method
 from garat_jax.types import Params, Policy
 
 FORMAT = "garat-ground/1"

@@ -15,41 +15,12 @@ from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.errors import UserError, choose
 from garat_jax.ground.steps import Bounds
-from garat_jax.methods.garat import GARATConfig
-from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.recorded import RecordedEnv, Steps, as_transitions, clone, nearest_command
 from garat_jax.runs import RunDirectory
-from garat_jax.transfer import make_method
+from garat_jax.transfer import GroundConfig, make_method
 
 CARD, SUMMARY, TRANSFORMER = "model.toml", "summary.json", "transformer"
 """What a run holds: the model's card, what came out, and the folder of the checkpoint."""
-
-
-@dataclasses.dataclass(frozen=True)
-class GroundConfig:
-    """Settings of grounding on measurements; presets give tuned ones.
-
-    Attributes:
-        method: Its name.
-        learner: Its settings.
-        num_updates: Of the action transformer.
-        num_transitions: Most recorded control steps that it learns from, drawn at random.
-        num_held_out: Most held-out control steps that the transition error is measured on.
-        episode: Seconds that a rollout in the source goes on from a recorded state.
-    """
-
-    method: str
-    learner: GARATConfig | GATConfig
-    num_updates: int
-    num_transitions: int = 5000  # Desai et al. 2020
-    num_held_out: int = 2000
-    episode: float = 0.5
-
-    def reaching(self, reach: float) -> GARATConfig | GATConfig:
-        """Return the learner's settings, GARAT's with a reach in half-ranges of the action."""
-        if isinstance(self.learner, GATConfig):
-            return self.learner
-        return dataclasses.replace(self.learner, reach=reach)
 
 
 def make_source(
