@@ -16,13 +16,15 @@ from rich.console import Console
 from garat_jax import compilation_cache, dynamics, provenance
 from garat_jax.compiler_options import FUSION_EMITTERS, is_known_option
 from garat_jax.devices import use
-from garat_jax.dynamics import PhysicsState
+from garat_jax.dynamics import Dynamics, PhysicsState
 from garat_jax.overrides import load_spec
 
 PENDULUM = Path(__file__).parent / "envs" / "assets" / "pendulum.xml"
 SECONDS = 1.25
 """Of each of the four measurements: 5 s in all."""
 BATCH = 64
+BATCHES = (1, BATCH)
+"""Simulations side by side."""
 NUM_STEPS = 100
 """In one call of a program."""
 ENGINES = ("mujoco", "mjx")
@@ -63,15 +65,19 @@ def examine(device: str, seconds: float = SECONDS) -> Examination:
         UserError: There is no such device.
     """
     devices = use(device)
-    cases = list(itertools.product(ENGINES, (1, BATCH)))
     with Console(stderr=True).status("compiling and measuring"):
-        prepared = [prepare(engine, batch) for engine, batch in cases]
+        prepared = {}
         with ThreadPoolExecutor() as pool:
-            programs = list(pool.map(lambda case: case[0].compile(), prepared))
-        rates = [
-            Rate(*case, measure(program, start, case[1], seconds))
-            for case, program, (_, start) in zip(cases, programs, prepared, strict=True)
-        ]
+            for engine in reversed(ENGINES):  # MJX compiles longest: let it begin first
+                world = dynamics.compile(load_spec(PENDULUM), engine=engine)
+                for batch in BATCHES:
+                    lowered, start = prepare(world, batch)
+                    prepared[engine, batch] = pool.submit(lowered.compile), start
+        rates = []
+        for engine, batch in itertools.product(ENGINES, BATCHES):
+            program, start = prepared[engine, batch]
+            rate = measure(program.result(), start, batch, seconds)
+            rates.append(Rate(engine, batch, rate))
     return Examination(facts(devices), rates, advise(rates, devices[0].platform))
 
 
@@ -101,9 +107,8 @@ def _held(folder: Path) -> str:
     return f"{len(sizes)} in {folder}, {sum(sizes) / 2**20:.0f} MiB"
 
 
-def prepare(engine: str, batch: int) -> tuple[jax.stages.Lowered, PhysicsState]:
+def prepare(world: Dynamics, batch: int) -> tuple[jax.stages.Lowered, PhysicsState]:
     """Return a program, not compiled yet, that swings a batch of pendulums, and its start."""
-    world = dynamics.compile(load_spec(PENDULUM), engine=engine)
 
     def begin(angle: jax.Array) -> PhysicsState:
         return dynamics.initial_state(world, angle[None], jnp.zeros(1))
