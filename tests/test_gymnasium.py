@@ -21,6 +21,8 @@ from garat_jax.errors import UserError
 from garat_jax.methods.grounded import GroundedEnv, Grounding
 from tests.probe_envs import Walk, WalkParams
 
+WALK = (Walk(), WalkParams(0.1))
+
 
 def plain():
     world = make_world(HalfCheetah(), engine="mujoco")
@@ -150,6 +152,15 @@ def test_the_final_observation_is_that_before_the_reset():
     assert infos["final_obs"][0] is None
     assert infos["final_obs"][1][0] < -0.8
     assert abs(obs[1, 0]) <= 0.1
+
+
+def test_what_they_return_may_be_written_to():
+    env, vector = to_gymnasium(*WALK), to_gymnasium_vector(*WALK, 2)
+    for found in (
+        (env.reset(seed=0)[0], env.step(np.ones(1))[0]),
+        (vector.reset(seed=0)[0], *vector.step(np.ones((2, 1)))[:4]),
+    ):
+        assert all(array.flags.writeable for array in found)
 
 
 def test_wrappers_of_the_vector_count_episodes():

@@ -78,9 +78,8 @@ def _programs(world: World, agent, config: TRPOConfig) -> dict[str, Callable]:
 
     def direction(weights, batch: Batch) -> jax.Array:
         flat, unflatten = ravel_pytree(weights)
-        product = trpo.fisher_vector_product(
-            policy_net, flat, unflatten, batch.obs, config.cg_damping
-        )
+        seen = batch.obs[trpo.spread(batch.obs.shape[0], config.fisher_share)]
+        product = trpo.fisher_vector_product(policy_net, flat, unflatten, seen, config.cg_damping)
         found = trpo.conjugate_gradient(product, jnp.ones_like(flat), config.cg_iterations)
         return found @ product(found)
 

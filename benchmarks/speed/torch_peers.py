@@ -108,8 +108,9 @@ def make_envs(env_name: str, world: World, stepped: str, num_envs: int) -> VecEn
 def make_trpo(envs: VecEnv) -> TRPO:
     """Build sb3-contrib's TRPO with the hyper-parameters of ours.
 
-    Ours normalises observations on top, which would cost the peer time, and shuffles the value's
-    minibatches without the incomplete last one.
+    Ours normalises observations on top, which would cost the peer time, and leaves out the value's
+    incomplete last minibatch. The peer takes the share of the batch on which ours estimates the
+    Fisher information for the whole step of the policy, which costs it less.
     """
     config = TRPOConfig()
     return TRPO(

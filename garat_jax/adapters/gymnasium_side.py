@@ -1,4 +1,7 @@
-"""Our environments as Gymnasium's, one by one or as a vector."""
+"""Our environments as Gymnasium's, one by one or as a vector.
+
+What they return are copies: NumPy shows JAX's arrays as they are, and nobody may write to those.
+"""
 
 import functools
 from typing import Any
@@ -57,7 +60,7 @@ class GymnasiumEnv(gymnasium.Env):
         if seed is not None or self._key is None:
             self._key = _first_key(self.np_random)
         self._state, self._key = self._start(self._params, self._key)
-        return np.asarray(self._state.obs, np.float32), {}
+        return np.array(self._state.obs, np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Take one control step.
@@ -70,7 +73,7 @@ class GymnasiumEnv(gymnasium.Env):
         action = np.asarray(action, np.float32)
         result, self._key = self._step(self._params, self._state, action, self._key)
         self._state = result.state
-        obs = np.asarray(result.state.obs, np.float32)
+        obs = np.array(result.state.obs, np.float32)
         return obs, float(result.reward), bool(result.terminated), bool(result.truncated), {}
 
 
@@ -115,7 +118,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             self._keys = jnp.stack([_first_key(random) for random in randoms])
         self._states, self._keys = self._start(self._params, self._keys)
         self._over = np.zeros(self.num_envs, bool)
-        return np.asarray(self._states.obs, np.float32), {}
+        return np.array(self._states.obs, np.float32), {}
 
     def step(
         self, actions: np.ndarray
@@ -131,14 +134,14 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         result, self._states, self._keys = self._step(
             self._params, self._states, actions, self._keys, self._over
         )
-        terminated, truncated = np.asarray(result.terminated), np.asarray(result.truncated)
+        terminated, truncated = np.array(result.terminated), np.array(result.truncated)
         infos = {}
         if self._same_step:
-            infos = _final(np.asarray(result.state.obs, np.float32), terminated | truncated)
+            infos = _final(np.array(result.state.obs, np.float32), terminated | truncated)
         else:
             self._over = terminated | truncated
-        obs = np.asarray(self._states.obs, np.float32)
-        return obs, np.asarray(result.reward, np.float64), terminated, truncated, infos
+        obs = np.array(self._states.obs, np.float32)
+        return obs, np.array(result.reward, np.float64), terminated, truncated, infos
 
 
 def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
