@@ -63,7 +63,7 @@ def grow(name: str, grows: str, sizes: Sequence[Size], arguments: Arguments) -> 
         rows += measure(sides, arguments.repetitions)
     for row in rows:
         row |= {"grows": grows, "load_average_before": busy}
-        row.pop("share_of_random_actions", None)
+        row.pop("share_of_random_actions", None)  # each agent is measured by itself
         print(
             f"{name:18} {row['agent']:15} seeds {row['seeds']:2} envs {row['envs']:4} steps "
             f"{row['steps']:4} {row['steps_per_second']:9,.0f} steps/s",

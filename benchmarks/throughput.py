@@ -107,11 +107,13 @@ def measure_world(name: str, arguments: Arguments) -> tuple[list[dict], list[dic
 def show(row: dict[str, Any]) -> None:
     ratio = row.get("ours_over_this")
     share = row.get("share_of_random_actions")
+    engine = row.get("share_of_engine_alone")
     print(
         f"{row['env']:18} {row['agent']:23} {row['engine']:7} seeds {row['seeds']} envs "
         f"{row['envs']:3} {row['steps_per_second']:9,.0f} steps/s "
         f"{row['steps_per_processor_second']:9,.0f} a processor second"
         + (f", {share:.2f} of random actions'" if share else "")
+        + (f", {engine:.2f} of the engine's" if engine else "")
         + (f"; ours is {ratio:.1f} times as fast" if ratio else ""),
         flush=True,
     )

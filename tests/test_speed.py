@@ -31,6 +31,7 @@ def test_sides_run_in_turns_and_are_compared_with_random_actions():
     assert random["share_of_random_actions"] == 1.0
     rates = trpo["steps_per_second"], random["steps_per_second"]
     assert trpo["share_of_random_actions"] == rates[0] / rates[1]
+    assert "share_of_engine_alone" not in trpo
     assert trpo["slowest"] <= trpo["steps_per_second"] <= trpo["fastest"]
 
 

@@ -17,9 +17,7 @@ from garat_jax.compiler_options import compiler_options
 from garat_jax.env import Env, World
 from garat_jax.types import Agent
 
-from .sides import RANDOM, Side
-
-ENGINE_ALONE = "engine alone"
+from .sides import ENGINE_ALONE, RANDOM, Side
 
 
 class Size(NamedTuple):

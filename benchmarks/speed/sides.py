@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-RANDOM = "random actions"
-"""The side whose rate those that learn are compared with."""
+RANDOM, ENGINE_ALONE = "random actions", "engine alone"
+"""The sides whose rates the others' are compared with."""
 
 RATIOS = {
     "ours_over_this": (1, 50),
@@ -49,16 +49,15 @@ def measure(sides: Sequence[Side], repetitions: int) -> list[dict[str, Any]]:
 
     Returns:
         Each side's row with its steps a second and a processor second, the slowest and the fastest
-        run, and its share of the random actions' rate, where there is such a side with the same
-        engine and numbers of seeds and environments.
+        run, and its shares of the rates of random actions and of the engine alone, where there are
+        such sides with the same engine and numbers of seeds and environments.
     """
     taken = np.asarray([[seconds_of(side.run) for side in sides] for _ in range(repetitions)])
     seconds, busy = np.median(taken, axis=0).T
     steps = np.asarray([side.env_steps for side in sides])
-    raw = {
-        _world_of(side.row): rate
+    rates = {
+        (side.row["agent"], _world_of(side.row)): rate
         for side, rate in zip(sides, steps / seconds, strict=True)
-        if side.row["agent"] == RANDOM
     }
     rows = []
     for number, side in enumerate(sides):
@@ -69,8 +68,9 @@ def measure(sides: Sequence[Side], repetitions: int) -> list[dict[str, Any]]:
             "slowest": side.env_steps / taken[:, number, 0].max(),
             "fastest": side.env_steps / taken[:, number, 0].min(),
         }
-        if _world_of(row) in raw:
-            row["share_of_random_actions"] = rate / raw[_world_of(row)]
+        for agent in (RANDOM, ENGINE_ALONE):
+            if (raw := rates.get((agent, _world_of(row)))) is not None:
+                row[f"share_of_{agent.replace(' ', '_')}"] = rate / raw
         rows.append(row)
     return rows
 
