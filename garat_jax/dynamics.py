@@ -156,9 +156,15 @@ def initial_state(dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array) -> Physi
         act=jnp.zeros(host.na, dtype),
         qacc_warmstart=jnp.zeros(host.nv, dtype),
         sensordata=jnp.zeros(host.nsensordata, dtype),
-        memory=tuple(effect.init(host) for effect in dynamics.effects),
+        memory=(),
     )
-    return note(dynamics, state, 0.0)
+    return adopt(dynamics, state)
+
+
+def adopt(dynamics: Dynamics, state: PhysicsState) -> PhysicsState:
+    """Return the state of a world with other effects as one of this, whose effects begin anew."""
+    memory = tuple(effect.init(dynamics.host.model) for effect in dynamics.effects)
+    return note(dynamics, state._replace(memory=memory), 0.0)
 
 
 def sensed(dynamics: Dynamics, state: PhysicsState) -> PhysicsState:

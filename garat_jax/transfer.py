@@ -6,6 +6,7 @@ the ungrounded source, and training with action noise alone.
 """
 
 import dataclasses
+import functools
 import zlib
 from typing import Any
 
@@ -13,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from garat_jax import rollout, split, summary, train
+from garat_jax import dynamics, rollout, split, summary, train
 from garat_jax.agents import trpo
 from garat_jax.agents.actor_critic import ActorCriticState, PolicyParams
 from garat_jax.agents.trpo import TRPOConfig
@@ -218,7 +219,7 @@ class Experiment:
             )
             transitions = recorded.transitions
             executed = transitions._replace(action=target.env.clip(transitions.action))
-            return recorded._replace(transitions=executed)
+            return as_of(self.worlds.source, target, recorded._replace(transitions=executed))
 
         return self.map(collect, policy, _fold(self.keys, name))
 
@@ -251,6 +252,16 @@ class Experiment:
         """Return the ungrounded source's transition error, [seeds]."""
         source = self.worlds.source
         return self.map(lambda data: transition_error(source.env, source.params, data), held_out)
+
+
+def as_of(source: World, target: World, recorded: Recorded) -> Recorded:
+    """Return what was recorded in the target with states, [T, B], that the source can begin in."""
+    effects = [jax.tree.structure(world.params.effects) for world in (source, target)]
+    if effects[0] == effects[1]:
+        return recorded
+    adopt = jax.vmap(jax.vmap(functools.partial(dynamics.adopt, source.params)))
+    states = recorded.states._replace(physics=adopt(recorded.states.physics))
+    return recorded._replace(states=states)
 
 
 def make_method(env: Env, agent: Policy, config: GARATConfig | GATConfig) -> GARAT | GAT:

@@ -1,12 +1,16 @@
 """The pairs differ in what the paper's table says, and in nothing else."""
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from garat_jax import dynamics
+from garat_jax import dynamics, rollout
 from garat_jax.envs.pairs import PAIRS
+from garat_jax.methods.transition_error import transition_error
 from garat_jax.overrides import load_spec
+from garat_jax.transfer import as_of
 
 # Desai et al. 2020, table of modified environments.
 MASSES = [
@@ -53,3 +57,23 @@ def test_only_the_foots_sliding_friction_differs():
     target.geom_friction[foot, 0] = 2.0
     np.testing.assert_array_equal(source.geom_friction, target.geom_friction)
     np.testing.assert_array_equal(source.body_mass, target.body_mass)
+
+
+@pytest.mark.parametrize("name", ["inverted_pendulum_heavy", "minitaur"])
+def test_what_the_target_showed_can_be_replayed_in_the_source(name):
+    """Minitaur's target has an effect that the source lacks, and so another memory."""
+    source, target = PAIRS[name].worlds("mujoco")
+
+    def uniform(params, obs, key):
+        del params, obs
+        return jax.random.uniform(key, (target.env.action_size,), minval=-1), jnp.zeros(())
+
+    def errors(key):
+        recorded = rollout.record(target.env, target.params, uniform, (), key, 3, 4)
+        replayed = transition_error(target.env, target.params, recorded)
+        shown = as_of(source, target, recorded)
+        return replayed, transition_error(source.env, source.params, shown)
+
+    same, other = jax.jit(errors)(jax.random.key(0))
+    assert same < 1e-6
+    assert other > 1e-3
