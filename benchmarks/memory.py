@@ -68,11 +68,11 @@ def measure(pair: str, arguments: Arguments) -> dict[str, Any]:
         done = subprocess.run(
             command,
             env={**environment, "XDG_CACHE_HOME": f"{root}/cache"},
-            check=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
+            capture_output=True,
             text=True,
         )
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
     row = {
         "pair": pair,
         "method": arguments.method,

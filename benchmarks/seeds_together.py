@@ -83,13 +83,16 @@ def seconds_of_process(
     command = [sys.executable, "-W", "ignore", __file__, "--steps", str(steps), "--train", what]
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     started = time.perf_counter()
-    subprocess.run(
+    done = subprocess.run(
         command,
         env={**environment, "XDG_CACHE_HOME": str(cache)},
-        check=True,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
-    return time.perf_counter() - started
+    seconds = time.perf_counter() - started
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
+    return seconds
 
 
 def measure_once(name: str, cache: str, seeds: int, steps: int) -> tuple[float, list[float]]:
