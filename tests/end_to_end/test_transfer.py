@@ -16,9 +16,11 @@ import pytest
 from garat_jax import checkpoint
 from garat_jax.agents.trpo import TRPOConfig
 from garat_jax.envs.pairs import PAIRS
-from garat_jax.presets import garat
+from garat_jax.methods.gat import GATConfig
+from garat_jax.presets import METHODS
 from garat_jax.runs import RunDirectory
 from garat_jax.transfer import TransferConfig, run_transfer
+from tests.test_split import finish, free_port
 
 pytestmark = pytest.mark.slow  # a dozen programs to compile
 
@@ -34,21 +36,26 @@ STAGES = [
 ]
 
 
-def tiny() -> TransferConfig:
+def tiny(pair: str = NAME, method: str = "garat", engine: str = "mujoco") -> TransferConfig:
     """Return settings under which every part runs and nothing is learned."""
-    preset = garat(PAIRS[NAME], seeds=len(SEEDS), engine="mujoco")
+    preset = METHODS[method](PAIRS[pair], seeds=len(SEEDS), engine=engine)
     small = {"num_envs": 4, "num_steps": 16, "hidden": (8,)}
-    return dataclasses.replace(
-        preset,
-        agent=TRPOConfig(**small, cg_iterations=3, value_epochs=1, value_minibatch=32),
-        grounding=dataclasses.replace(
-            preset.grounding,
+    learner = preset.grounding
+    if isinstance(learner, GATConfig):
+        learner = GATConfig(**small, minibatch=16, num_epochs=1)
+    else:
+        learner = dataclasses.replace(
+            learner,
             transformer=dataclasses.replace(
-                preset.grounding.transformer, **small, num_epochs=1, num_minibatches=2
+                learner.transformer, **small, num_epochs=1, num_minibatches=2
             ),
             hidden=(8,),
             num_minibatches=2,
-        ),
+        )
+    return dataclasses.replace(
+        preset,
+        agent=TRPOConfig(**small, cg_iterations=3, value_epochs=1, value_minibatch=32),
+        grounding=learner,
         max_iterations=2,
         num_updates=2,
         num_retraining=2,
@@ -117,6 +124,63 @@ def test_a_finished_run_resumed_gives_the_same_numbers(finished):
     root, result = finished
     again = run_transfer(tiny(), directory(root, resume=True))
     assert {**again, "seconds": None} == {**result, "seconds": None}
+
+
+@pytest.mark.parametrize(
+    ("pair", "method", "engine"),
+    [
+        *((pair, "garat", "mujoco") for pair in PAIRS if pair != NAME),
+        (NAME, "gat", "mujoco"),
+        (NAME, "garat", "mjx"),
+    ],
+)
+def test_every_pair_method_and_engine_runs_whole(tmp_path, pair, method, engine):
+    result = run_transfer(tiny(pair, method, engine), directory(tmp_path / "run"))
+    assert (result["pair"], result["method"]) == (pair, method)
+    for group in ("returns", "transition_error"):
+        for numbers in result[group].values():
+            assert np.isfinite(numbers).all()
+    assert min(result["transition_error"]["source"]) > 0
+
+
+TOGETHER = """
+import sys
+from pathlib import Path
+from garat_jax import devices
+from garat_jax.transfer import run_transfer
+from tests.end_to_end.test_transfer import directory, tiny
+
+devices.join_processes(None, None, None)
+run_transfer(tiny(), directory(Path(sys.argv[1])))
+"""
+
+
+def test_two_processes_find_what_one_finds(tmp_path, finished, repository):
+    address = f"localhost:{free_port()}"
+    roots = [tmp_path / "0", tmp_path / "1"]
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-W", "ignore", "-c", TOGETHER, str(root)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=repository,
+            env={
+                **os.environ,
+                "JAX_COORDINATOR_ADDRESS": address,
+                "JAX_NUM_PROCESSES": "2",
+                "JAX_PROCESS_ID": str(number),
+            },
+        )
+        for number, root in enumerate(roots)
+    ]
+    for process in processes:
+        finish(process)
+    for root in roots:
+        found = json.loads((root / "summary.json").read_text())
+        for group in ("returns", "transition_error"):
+            for name, numbers in finished[1][group].items():
+                np.testing.assert_allclose(found[group][name], numbers, rtol=1e-3)
 
 
 def start_command(*arguments: str) -> subprocess.Popen[str]:
