@@ -173,16 +173,43 @@ def test_few_failures_of_physics_are_told_and_many_stop_the_run(tmp_path, capsys
     assert checkpoint.latest_step(loop.run.path("checkpoints/worlds")) == 2
 
 
-def test_the_step_in_which_physics_failed_is_left_as_it_was(tmp_path):
-    strong = Override("actuator", "slide", "gear", 1e13)
-    world = make_world(InvertedPendulum(), (strong,), engine="mujoco")
+ENGINES = pytest.mark.parametrize("engine", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
+
+
+def pendulums(engine: str, gear: float):
+    """Return a step and a start of PPO on pendulums whose motor is so strong, and their params."""
+    strong = Override("actuator", "slide", "gear", gear)
+    world = make_world(InvertedPendulum(), (strong,), engine=engine)
     agent = ppo.make(world.env, ppo.PPOConfig(num_envs=4, num_steps=8, hidden=(8,)))
     keys = jax.vmap(jax.random.key)(jnp.asarray(SEEDS))
     start = jax.vmap(lambda key: agent.init(key, world.params))(keys)
     step = jax.vmap(lambda state, params: agent.step(state, params)[:2], (0, None))
+    return step, start, world.params
+
+
+@ENGINES
+def test_a_world_that_fails_once_ends_its_episode_and_training_goes_on(
+    tmp_path, capsys, engine, monkeypatch
+):
+    monkeypatch.setattr(train, "LARGEST_FAULTY_SHARE", 0.1)
+    step, start, params = pendulums(engine, 100.0)
+    lost = start.env.physics.qvel.at[0, 2, 1].set(jnp.nan)  # one of the first seed's four
+    start = start._replace(env=start.env._replace(physics=start.env.physics._replace(qvel=lost)))
+    run = directory(tmp_path / "run")
+    state = Trainer(run, SEEDS).train("once", step, start, params, 2)
+    assert [line["faulty_share"] for line in run.metrics()] == [[1 / 32, 0.0], [0.0, 0.0]]
+    assert "left the finite numbers in 3.1 % of the steps of iteration 1" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((state.env.obs, state.policy)))
+
+
+@ENGINES
+def test_the_step_in_which_physics_failed_is_left_as_it_was(tmp_path, engine):
+    step, start, params = pendulums(engine, 1e13)
     run = directory(tmp_path / "run")
     with pytest.raises(DivergedError):
-        trainer(run).train("burst", step, start, world.params, 5)
+        trainer(run).train("burst", step, start, params, 5)
     with np.load(run.root / "diverged" / "burst-1.npz", allow_pickle=False) as kept:
         assert (kept[".fault.num_steps"] > 0).all()
         before, after = kept[".fault.before.physics.qpos"], kept[".fault.after.physics.qvel"]
