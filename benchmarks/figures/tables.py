@@ -135,6 +135,49 @@ def ground() -> str:
     return table(columns, rows) + origin("ground", result)
 
 
+def fidelity() -> str:
+    """Three rows a world: MuJoCo's defaults, the fastest faithful settings, and one iteration."""
+    paths = sorted((ROOT / "benchmarks/results").glob("fidelity_*.json"))
+    if not paths:
+        return "Not measured yet: `python benchmarks/fidelity.py`.\n"
+    results = [read(path.stem) for path in paths]
+    lines = []
+    for result in results:
+        rows = [row for row in result["rows"] if row["engine"] == "mjx"]
+        best = max(
+            (row for row in rows if row["faithful"]), key=lambda row: row["steps_per_second"]
+        )
+        single = next(row for row in rows if row["iterations"] == 1)
+        lines += [_settings(row, rows[0]) for row in (rows[0], best, single)]
+    columns = (
+        "target of",
+        "solver",
+        *(f"velocity error, {steps}" for steps in ("1 step", "5 steps", "50 steps")),
+        "growth of 1e-7, 50 steps",
+        "not finite",
+        "speed",
+        "faithful",
+    )
+    machine = results[0]["machine"]
+    commits = ", ".join(sorted({result["git"]["commit"][:7] for result in results}))
+    return table(columns, lines) + (
+        "\n`python benchmarks/fidelity.py` → `benchmarks/results/fidelity_*.json` "
+        f"(commit {commits}, {machine['cores']} cores of an {machine['cpu']})\n"
+    )
+
+
+def _settings(row: dict[str, Any], strict: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        row["pair"],
+        f"{row['solver']} {row['iterations']}/{row['ls_iterations']}",
+        *(f"{row['qvel_error'][horizon]:.0e}" for horizon in ("1", "5", "50")),
+        f"{row['qvel_growth']['50']:.0e}",
+        str(row["not_finite"]),
+        f"{row['steps_per_second'] / strict['steps_per_second']:.1f} x",
+        "yes" if row["faithful"] else "no",
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "transfer": transfer,
     "variants": variants,
@@ -144,6 +187,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "seeds_together": speed_tables.seeds_together,
     "memory": speed_tables.memory,
     "flags": flags,
+    "fidelity": fidelity,
     "real_data": real_data,
     "ground": ground,
 }
