@@ -174,8 +174,12 @@ def test_two_processes_find_what_one_finds(tmp_path, finished, repository):
         )
         for number, root in enumerate(roots)
     ]
-    for process in processes:
-        finish(process)
+    try:
+        for process in processes:
+            finish(process)
+    finally:
+        for process in processes:
+            process.kill()
     for root in roots:
         found = json.loads((root / "summary.json").read_text())
         for group in ("returns", "transition_error"):
