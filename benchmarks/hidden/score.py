@@ -11,8 +11,8 @@ import numpy as np
 from garat_jax.diagnosis import Diagnosis, Model, Recording
 from garat_jax.diagnosis.diagnose import split, thin
 from garat_jax.diagnosis.fit import settle
+from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import make_metric
 from garat_jax.diagnosis.results import Candidate, Named
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator

@@ -9,9 +9,9 @@ import numpy as np
 from garat_jax.diagnosis.diagnose import choose_horizon, thin
 from garat_jax.diagnosis.fit import Fit, count_timestep, fit, settle
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import make_metric
 from garat_jax.diagnosis.results import Estimate
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator

@@ -19,10 +19,10 @@ from garat_jax.diagnosis.fit import settle
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.metric import ABOVE_FLOOR, Floor, make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.quality import Quality, assess
-from garat_jax.diagnosis.rank import ABOVE_FLOOR, Floor, make_metric, noise_floor
 from garat_jax.diagnosis.replay import Replay, Size, replay_with
 from garat_jax.diagnosis.residuals import Residuals, examine
 from garat_jax.diagnosis.results import Errors

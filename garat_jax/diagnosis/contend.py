@@ -56,15 +56,50 @@ def fit_contenders(
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
         if hopeless and not alike and len(contenders) > 1:
             continue
-        effect = problem.simulator.effects[score.effect]
-        say(f"fitting {effect.kind} at {effect.target}")
-        contenders.append(Contender(score, _fit_with(problem, current, score, rival)))
+        contenders.append(_fit(problem, current, score, rival, say))
     return contenders
 
 
-def _fit_with(problem: Problem, current: Fit, score: Score, rival: float) -> Fit:
+def fit_refinements(
+    problem: Problem,
+    current: Fit,
+    best: Contender,
+    scores: Sequence[Score],
+    say: Callable[[str], None],
+) -> list[Contender]:
+    """Fit the laws that refine the best contender's at its place, from where they are alike.
+
+    That something acts there is the simpler law's evidence, which they take over.
+    """
+    effects = problem.simulator.effects
+    simple = effects[best.score.effect]
+    values = problem.simulator.with_parameters([float(v) for v in best.fit.theta])
+    rival = best.fit.cost[problem.fitted].sum()
+    contenders = []
+    for score in scores:
+        law = effects[score.effect]
+        if law.target != simple.target or simple.kind not in law.refines:
+            continue
+        alike = type(law).refined_from(values[best.score.effect])
+        columns = {
+            slot.parameter.name: j
+            for j, slot in enumerate(problem.simulator.slots)
+            if slot.effect == score.effect
+        }
+        start = {columns[name]: value for name, value in alike.items()}
+        score = dataclasses.replace(
+            score, columns=tuple(columns.values()), start=start, p_value=best.score.p_value
+        )
+        contenders.append(_fit(problem, current, score, rival, say))
+    return contenders
+
+
+def _fit(problem: Problem, current: Fit, score: Score, rival: float, say) -> Contender:
     """Fit the selected effects and one more, from where screening puts it."""
+    effect = problem.simulator.effects[score.effect]
+    say(f"fitting {effect.kind} at {effect.target}")
     theta = current.theta.copy()
     theta[list(score.start)] = list(score.start.values())
     free = (*current.free, *score.columns)
-    return fit(problem, theta, current.start, free, CONTENDER_STEPS, rival, current.sensitivity)
+    fitted = fit(problem, theta, current.start, free, CONTENDER_STEPS, rival, current.sensitivity)
+    return Contender(score, fitted)

@@ -11,9 +11,10 @@ import numpy as np
 from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, signals
+from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import Outcome, explain, make_metric
+from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import Segments, choose_grid, cut, nearby_starts
 from garat_jax.diagnosis.separate import next_experiment

@@ -14,9 +14,9 @@ from garat_jax.diagnosis.diagnose import UNEXPLAINED, choose_horizon, diagnose, 
 from garat_jax.diagnosis.export import copy_model
 from garat_jax.diagnosis.fit import settle
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, load_model, save_card
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import make_metric
 from garat_jax.diagnosis.repeat import found_theta, nominal_effects, repeatability
 from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosis_sections
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict

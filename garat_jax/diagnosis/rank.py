@@ -11,50 +11,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, fit_contenders
+from garat_jax.diagnosis.contend import Contender, fit_contenders, fit_refinements
 from garat_jax.diagnosis.fit import Fit, count_timestep, fit, settle
-from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels
+from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor
+from garat_jax.diagnosis.problem import Problem, block_labels
 from garat_jax.diagnosis.results import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, screen
 from garat_jax.effects import unit_at
 
-ABOVE_FLOOR = 1.5
-"""A model is adequate up to this multiple of the noise floor."""
 SMALLEST_SHARE = 0.05
 """Share of the residual that an effect must explain."""
 SIGNIFICANCE = 0.01
 """Largest corrected p-value."""
 STABLE = 0.8
 """Share of block resamples in which an effect must be first."""
+WORTH_REFINING = 1.1
+"""Multiple of the noise floor above which refinements of the best law are tried."""
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 ROUNDS = 5
 RESAMPLES = 500
-
-
-class Metric(NamedTuple):
-    """The error that is reported: see `results.Errors`.
-
-    Attributes:
-        weight: Squared metric of one squared whitened residual, [N].
-        counted: Which residuals are samples and not padding, [S, N].
-        spread: Standard deviation of each signal in the held-out data, [num_signals].
-    """
-
-    weight: np.ndarray
-    counted: np.ndarray
-    spread: np.ndarray
-
-    def error(self, residual: np.ndarray, chosen: np.ndarray) -> float:
-        """Return the root mean square over samples and signals of the chosen segments."""
-        squares = residual[chosen] ** 2 * self.weight
-        return float(np.sqrt(squares.sum() / max(self.counted[chosen].sum(), 1)))
-
-    def by_signal(self, residual: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """Return the error of each signal in units of its noise, [num_signals]."""
-        num_signals = len(self.spread)
-        squares = (residual[chosen] ** 2 * self.counted[chosen]).reshape(-1, num_signals)
-        return np.sqrt(squares.sum(axis=0) / self.counted[chosen].sum() * num_signals)
 
 
 class Step(NamedTuple):
@@ -90,45 +66,6 @@ class Outcome(NamedTuple):
     best: Fit | None
 
 
-def make_metric(problem: Problem) -> Metric:
-    """Make the metric: errors relative to each signal's spread in the held-out data."""
-    s = problem.segments
-    held_out = (s.weight > 0) & ~problem.fitted[:, None]
-    spread = s.measured[held_out].std(axis=0) + 1e-12
-    weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
-    return Metric(weight, np.repeat(s.weight > 0, s.measured.shape[2], axis=1), spread)
-
-
-class Floor(NamedTuple):
-    """The held-out error that noise and the integrator's error would make by themselves.
-
-    Attributes:
-        error: In the metric.
-        by_signal: In units of each signal's noise, [num_signals].
-    """
-
-    error: float
-    by_signal: np.ndarray
-
-
-def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
-    """Estimate the noise floor; a first-order integrator errs by twice what half a step changes."""
-    held_out = ~problem.fitted
-    change = problem.integrator_error(current.theta, current.start, current.residual)
-    change = 2.0 * StartSpace(current.sensitivity).remove(change[..., None])[..., 0]
-    noise = metric.counted.astype(float)
-    return Floor(
-        float(np.hypot(metric.error(noise, held_out), metric.error(change, held_out))),
-        np.hypot(1.0, metric.by_signal(change, held_out)),
-    )
-
-
-def is_above(problem: Problem, metric: Metric, current: Fit, floor: Floor) -> bool:
-    """Say whether any signal's held-out error is well above its noise floor."""
-    errors = metric.by_signal(current.residual, ~problem.fitted)
-    return bool(np.any(errors > ABOVE_FLOOR * floor.by_signal))
-
-
 def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> Outcome:
     """Add effects as long as one passes every gate.
 
@@ -151,6 +88,7 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         say(f"scoring the candidates, round {number + 1}")
         scores = screen(problem, current, held)
         contenders = fit_contenders(problem, current, scores, say) if gap else []
+        contenders = _refine(problem, metric, current, scores, contenders, floor, say)
         judged = _judge(problem, metric, current, scores, contenders, gap)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         candidate, contender = judged[0] if judged else (None, None)
@@ -169,6 +107,27 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
     if not is_above(problem, metric, current, floor):
         best = None
     return Outcome(before, current, candidates, tuple(steps), selected, floor.error, adequate, best)
+
+
+def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):
+    """Replace the best contender by a refinement of its law that certainly explains more.
+
+    Screening prefers the simpler law, because a refinement's threshold hides it there.
+    """
+    if not contenders:
+        return contenders
+    best = min(contenders, key=lambda c: c.fit.cost.sum())
+    if not is_above(problem, metric, best.fit, floor, WORTH_REFINING):
+        return contenders
+    for contender in fit_refinements(problem, current, best, scores, say):
+        costs = _block_costs(problem, 1.0, [best.fit, contender.fit], slice(None))
+        drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
+        lead = drawn[:, 0] - drawn[:, 1]
+        if np.quantile(lead, 0.025) > 0 and np.median(lead) > np.log(TOO_CLOSE):
+            replaced = (best.score.effect, contender.score.effect)
+            others = (c for c in contenders if c.score.effect not in replaced)
+            contenders, best = [contender, *others], contender
+    return contenders
 
 
 def _block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):
@@ -282,7 +241,7 @@ def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stabil
 def _gain(problem, metric: Metric, before: Fit, after: Fit, held_out) -> Interval:
     """Return the fall of the held-out error with a block-bootstrap interval."""
     costs = _block_costs(problem, metric.weight, [before, after], held_out)
-    count = max(metric.counted[held_out].sum(), 1)
+    count = metric.count(held_out)
     drawn = np.sqrt(_resamples(costs.shape[1]) @ costs.T / count)
     whole = np.sqrt(costs.sum(axis=1) / count)
     low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [0.025, 0.975])

@@ -232,6 +232,15 @@ class Effect(abc.ABC):
         first = cls.parameters()[0]
         return ({first.name: cls.at(host, target)[first.name] + first.scale},)
 
+    @classmethod
+    def refined_from(cls, simpler: "Effect") -> Mapping[str, float]:
+        """Return parameters near which this law is like a simpler one that it refines.
+
+        Args:
+            simpler: An effect of a kind in `refines`, with values.
+        """
+        raise NotImplementedError(f"{cls.kind} refines no {simpler.kind}")
+
     def export(self, spec: mujoco.MjSpec) -> str:
         """Write the effect into a spec as plain MJCF, as far as MJCF can say it.
 

@@ -160,20 +160,10 @@ class AsymmetricFriction(Effect):
     reads_state: ClassVar[bool] = True
 
     coulomb_positive: jax.Array = parameter(
-        0.0,
-        unit="N m",
-        low=0.0,
-        high=50.0,
-        scale=1e-3,
-        source="As coulomb_friction",
+        0.0, unit="N m", low=0.0, high=50.0, scale=1e-3, source="As coulomb_friction"
     )
     coulomb_negative: jax.Array = parameter(
-        0.0,
-        unit="N m",
-        low=0.0,
-        high=50.0,
-        scale=1e-3,
-        source="As coulomb_friction",
+        0.0, unit="N m", low=0.0, high=50.0, scale=1e-3, source="As coulomb_friction"
     )
     viscous_positive: jax.Array = parameter(
         0.0,
@@ -191,6 +181,13 @@ class AsymmetricFriction(Effect):
         scale=1e-3,
         source="As viscous_damping",
     )
+
+    @classmethod
+    def refined_from(cls, simpler: Effect) -> Mapping[str, float]:
+        """Begin with the same friction in both directions."""
+        name = simpler.kind.partition("_")[0]
+        size = float(getattr(simpler, simpler.parameters()[0].name))
+        return {f"{name}_positive": size, f"{name}_negative": size}
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Make the compiler reserve the friction constraint's row."""
@@ -275,6 +272,12 @@ class StribeckFriction(Effect):
         return tuple(
             {"coulomb": size, "static": 2.0 * size, "velocity": speed} for speed in (0.02, 0.1, 0.5)
         )
+
+    @classmethod
+    def refined_from(cls, simpler: Effect) -> Mapping[str, float]:
+        """Begin with a peak of half the friction in motion."""
+        size = float(getattr(simpler, simpler.parameters()[0].name))
+        return {"coulomb": size, "static": 1.5 * size, "velocity": 0.1}
 
     @property
     def excess(self) -> jax.Array:

@@ -13,13 +13,19 @@ MODEL = Model("pendulum", __file__, __file__, models.spec(models.PENDULUM))
 TIME = np.arange(750) * 0.004
 
 
-def record(change: Callable[[mujoco.MjSpec], None], seed: int, pull: float = 0.0) -> Recording:
+def record(
+    change: Callable[[mujoco.MjSpec], None],
+    seed: int,
+    pull: float = 0.0,
+    torque: Callable[[float], float] = lambda speed: 0.0,
+) -> Recording:
     """Record a pendulum that differs from the model, and at which a cable pulls [N m].
 
     Args:
         change: Makes the difference.
         seed: Draws commands and noise.
         pull: A constant torque.
+        torque: One more torque [N m] by the speed [rad/s].
     """
     rng = np.random.default_rng(seed)
     spec = models.spec(models.PENDULUM)
@@ -32,8 +38,10 @@ def record(change: Callable[[mujoco.MjSpec], None], seed: int, pull: float = 0.0
     states = []
     for command in ctrl:
         states.append([data.qpos[0], data.qvel[0]])
-        data.ctrl[0], data.qfrc_applied[0] = command, pull
-        mujoco.mj_step(model, data, round(0.004 / model.opt.timestep))
+        data.ctrl[0] = command
+        for _ in range(round(0.004 / model.opt.timestep)):
+            data.qfrc_applied[0] = pull + torque(data.qvel[0])
+            mujoco.mj_step(model, data)
     states = np.asarray(states) + 1e-3 * rng.normal(size=(len(TIME), 2)) * [1.0, 10.0]
     return Recording(
         name=f"pull {pull}, {seed}",

@@ -1,0 +1,39 @@
+"""A law that refines another is named where it explains more, and not where it does not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.diagnose import diagnose
+from garat_jax.effects import CATALOGUE
+from tests.diagnosis.pendulum import MODEL, record
+
+KINDS = ("coulomb_friction", "viscous_damping", "stribeck_friction", "asymmetric_friction")
+STATIC, COULOMB, SPEED = 0.15, 0.08, 0.4
+
+
+def weakening(speed: float) -> float:
+    """Return what friction loses in motion [N m]; the joint has its static size."""
+    return (STATIC - COULOMB) * np.sign(speed) * (1.0 - np.exp(-((speed / SPEED) ** 2)))
+
+
+def found_with(friction: float, torque):
+    model = dataclasses.replace(MODEL, catalogue={kind: CATALOGUE[kind] for kind in KINDS})
+
+    def rub(spec):
+        spec.joint("hinge").frictionloss = friction
+
+    return diagnose(model, [record(rub, seed, torque=torque) for seed in range(4)])
+
+
+def test_a_peak_at_rest_is_stribeck_friction():
+    (found,) = found_with(STATIC, weakening).selected
+    assert found.effect == "stribeck_friction"
+    assert found.parameters["coulomb"].estimate == pytest.approx(COULOMB, rel=0.1)
+
+
+def test_constant_dry_friction_is_not_refined():
+    (found,) = found_with(COULOMB, lambda speed: 0.0).selected
+    assert found.effect == "coulomb_friction"
+    assert found.parameters["torque"].estimate == pytest.approx(COULOMB, rel=0.05)
