@@ -12,8 +12,8 @@ from garat_jax.errors import UserError, choose
 
 
 @dataclasses.dataclass(frozen=True)
-class Compare:
-    """Measure the error of a model as it is, by signal and horizon."""
+class OnRecordings:
+    """What every command takes that holds a model against recordings."""
 
     model: Annotated[Positional[Path], arg(metavar="MODEL")]
     """MJCF (.xml) or model card (.toml)."""
@@ -21,22 +21,53 @@ class Compare:
     """Recordings (CSV, Parquet or NPZ), one a file."""
     map: Annotated[Path | None, arg(metavar="MAP.toml")] = None
     """How the recordings' columns are named, and in which units."""
+    effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
+    """Python files with effects of your own."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for the results; runs/COMMAND-MODEL by default."""
+    force: bool = False
+    """Replace an earlier run in DIR."""
+
+    def check(self) -> None:
+        """Refuse files that are not there.
+
+        Raises:
+            UserError: One is not.
+        """
+        check_files([self.model], "MODEL")
+        check_files(self.data, "DATA")
+        check_optional(self.map, "--map")
+
+    def folder(self, command: str) -> Path:
+        """Return where the results go."""
+        return self.out or Path("runs") / f"{command}-{self.model.stem}"
+
+
+@dataclasses.dataclass(frozen=True)
+class WithHoldout(OnRecordings):
+    """The same, with recordings that prove the result."""
+
+    holdout: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
+    """Recordings to prove the result on; by default some of DATA are held out."""
+
+    def check(self) -> None:
+        """Refuse files that are not there."""
+        super().check()
+        check_files(self.holdout or self.data, "--holdout")
+
+
+@dataclasses.dataclass(frozen=True)
+class Compare(OnRecordings):
+    """Measure the error of a model as it is, by signal and horizon."""
+
     also: Annotated[tuple[Path, ...], arg(metavar="MODEL...")] = ()
     """Other models to score in the same table, a repaired model card for example."""
     grounded: Annotated[tuple[Path, ...], arg(metavar="DIR...")] = ()
     """Runs of `garat ground` to score in the same table."""
-    effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
-    """Python files with effects of your own."""
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for compare.json and report.html; runs/compare-MODEL by default."""
-    force: bool = False
-    """Replace an earlier run in DIR."""
 
     def run(self) -> None:
         """Compare the model with the recordings."""
-        check_files([self.model], "MODEL")
-        check_files(self.data, "DATA")
-        check_optional(self.map, "--map")
+        self.check()
         check_files(self.also or [self.model], "--also")
         from garat_jax.diagnosis import load_model, run_compare
         from garat_jax.effects.catalogue import load_catalogue
@@ -48,48 +79,29 @@ class Compare:
             from garat_jax.presets import GROUNDING
 
             also += [load_grounded(path, GROUNDING, catalogue) for path in self.grounded]
-        out = self.out or Path("runs") / f"compare-{self.model.stem}"
-        with make_run(self, out) as run:
+        with make_run(self, self.folder("compare")) as run:
             found = run_compare(self.model, self.data, run, self.map, catalogue, also)
         say(str(found))
         say(f"report: {run.root / 'report.html'}")
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnose:
+class Diagnose(WithHoldout):
     """Find where a model fails and which physical effect it is missing."""
 
-    model: Annotated[Positional[Path], arg(metavar="MODEL")]
-    """MJCF (.xml) or model card (.toml)."""
-    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA...")]
-    """Recordings (CSV, Parquet or NPZ), one a file."""
-    holdout: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
-    """Recordings to prove the result on; by default some of DATA are held out."""
     condition: Annotated[tuple[str, ...], arg(metavar="NAME=FILE...")] = ()
     """Recordings under other conditions, such as with a payload: what DATA shows is shared by all,
     what these show besides is theirs."""
-    map: Annotated[Path | None, arg(metavar="MAP.toml")] = None
-    """How the recordings' columns are named, and in which units."""
-    effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
-    """Python files with effects of your own."""
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for diagnosis.json and report.html; runs/diagnose-MODEL by default."""
-    force: bool = False
-    """Replace an earlier run in DIR."""
 
     def run(self) -> None:
         """Diagnose the model."""
-        check_files([self.model], "MODEL")
-        check_files(self.data, "DATA")
-        check_files(self.holdout or self.data, "--holdout")
-        check_optional(self.map, "--map")
+        self.check()
         conditions = parse_conditions(self.condition)
         from garat_jax.diagnosis import run_diagnose
         from garat_jax.effects.catalogue import load_catalogue
 
         catalogue = load_catalogue(self.effects)
-        out = self.out or Path("runs") / f"diagnose-{self.model.stem}"
-        with make_run(self, out) as run:
+        with make_run(self, self.folder("diagnose")) as run:
             run_diagnose(self.model, self.data, self.holdout, run, self.map, catalogue, conditions)
         say(f"report: {run.root / 'report.html'}")
 
@@ -111,39 +123,20 @@ def parse_conditions(given: Sequence[str]) -> dict[str, list[Path]]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Improve:
+class Improve(WithHoldout):
     """Repair a model: diagnose, add what is missing, repeat until nothing more is certain.
 
     It writes DIR/model.toml with the model's files beside it, DIR/improve.json and DIR/report.html.
     """
 
-    model: Annotated[Positional[Path], arg(metavar="MODEL")]
-    """MJCF (.xml) or model card (.toml)."""
-    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA...")]
-    """Recordings (CSV, Parquet or NPZ), one a file."""
-    holdout: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
-    """Recordings to prove the result on; by default some of DATA are held out."""
-    map: Annotated[Path | None, arg(metavar="MAP.toml")] = None
-    """How the recordings' columns are named, and in which units."""
-    effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
-    """Python files with effects of your own."""
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for the results; runs/improve-MODEL by default."""
-    force: bool = False
-    """Replace an earlier run in DIR."""
-
     def run(self) -> None:
         """Repair the model."""
-        check_files([self.model], "MODEL")
-        check_files(self.data, "DATA")
-        check_files(self.holdout or self.data, "--holdout")
-        check_optional(self.map, "--map")
+        self.check()
         from garat_jax.diagnosis.improve import run_improve
         from garat_jax.effects.catalogue import load_catalogue
 
         catalogue = load_catalogue(self.effects)
-        out = self.out or Path("runs") / f"improve-{self.model.stem}"
-        with make_run(self, out) as run:
+        with make_run(self, self.folder("improve")) as run:
             done = run_improve(self.model, self.data, self.holdout, run, self.map, catalogue)
         say(str(done))
         say(f"model card: {run.root / 'model.toml'} {done.card}")
@@ -151,52 +144,34 @@ class Improve:
 
 
 @dataclasses.dataclass(frozen=True)
-class Ground:
+class Ground(WithHoldout):
     """Learn what physics does not explain: an action transformer of a model, from recordings.
 
     It writes DIR/summary.json, the transformer's checkpoint, the model and DIR/report.html; `garat
-    compare --grounded DIR` scores it beside other models.
+    compare --grounded DIR` scores it beside other models. A repaired model leaves less to learn.
     """
 
-    model: Annotated[Positional[Path], arg(metavar="MODEL")]
-    """MJCF (.xml) or model card (.toml); a repaired one leaves less to learn."""
-    data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA...")]
-    """Recordings (CSV, Parquet or NPZ), one a file."""
     method: str = "gat"
     """How to ground: gat or garat."""
-    holdout: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
-    """Recordings to prove the result on; by default some of DATA are held out."""
     policy: Annotated[Path | None, arg(metavar="FILE.py")] = None
     """The policy that acted: a function policy(obs, key); cloned from the commands by default."""
     interval: Annotated[float | None, arg(metavar="SECONDS")] = None
     """Length of a control step; about 0.02 s by default, in whole samples."""
     seed: int = 0
     """Seed of everything random."""
-    map: Annotated[Path | None, arg(metavar="MAP.toml")] = None
-    """How the recordings' columns are named, and in which units."""
-    effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
-    """Python files with effects of your own."""
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder for the results; runs/METHOD-MODEL by default."""
-    force: bool = False
-    """Replace an earlier run in DIR."""
     resume: bool = False
     """Go on from the last checkpoint in DIR."""
 
     def run(self) -> None:
         """Ground the model."""
-        check_files([self.model], "MODEL")
-        check_files(self.data, "DATA")
-        check_files(self.holdout or self.data, "--holdout")
-        check_optional(self.map, "--map")
+        self.check()
         from garat_jax.effects.catalogue import load_catalogue
         from garat_jax.ground import run_ground
         from garat_jax.presets import GROUNDING
 
         config = choose("method", self.method, GROUNDING)
         catalogue = load_catalogue(self.effects)
-        out = self.out or Path("runs") / f"{self.method}-{self.model.stem}"
-        with make_run(self, out, seeds=[self.seed], resume=self.resume) as run:
+        with make_run(self, self.folder(self.method), seeds=[self.seed], resume=self.resume) as run:
             done = run_ground(
                 self.model,
                 self.data,
