@@ -157,6 +157,8 @@ class Ground(WithHoldout):
     """The policy that acted: a function policy(obs, key); cloned from the commands by default."""
     interval: Annotated[float | None, arg(metavar="SECONDS")] = None
     """Length of a control step; about 0.02 s by default, in whole samples."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder for the results; runs/METHOD-MODEL by default."""
     seed: int = 0
     """Seed of everything random."""
     resume: bool = False

@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.diagnose import choose_horizon, diagnose, split, thin
@@ -44,7 +45,8 @@ def diagnose_conditions(
     Returns:
         The diagnosis of the base condition, with that of each other one in `conditions`: there the
         model has the shared effects, and a selected one of the same kind and place replaces one.
-        The selected effects' parameters are those that fit the recordings of all conditions.
+        The selected effects' parameters are those that fit the recordings of all conditions
+        together, save the unexplained ones; errors and candidates are of each condition by itself.
     """
     base = diagnose(model, recordings, holdout, say)
     shared = as_effects(model, base.selected)
@@ -52,12 +54,13 @@ def diagnose_conditions(
     for name, measured in conditions.items():
         say(f"the condition {name}")
         found[name] = diagnose(model, measured, say=say, shared=shared)
-    diagnoses = (base, *found.values())
-    if conditions and any(d.selected for d in diagnoses):
+    clear = [name for name, other in found.items() if other.verdict != "unexplained"]
+    together = (base, *(found[name] for name in clear))
+    if clear and base.verdict != "unexplained" and any(d.selected for d in together):
         say("fitting all conditions together")
-        fitted = [split(recordings, holdout)[0], *(split(c, ())[0] for c in conditions.values())]
-        base, *others = _fit_together(model, fitted, diagnoses)
-        found = dict(zip(found, others, strict=True))
+        fitted = [split(recordings, holdout)[0], *(split(conditions[n], ())[0] for n in clear)]
+        base, *others = _fit_together(model, fitted, together)
+        found |= dict(zip(clear, others, strict=True))
     return dataclasses.replace(base, conditions=found)
 
 
@@ -109,7 +112,7 @@ class JointSimulator:
         self.base = np.asarray([slot.base for slot in slots])
 
     @property
-    def host(self):
+    def host(self) -> mujoco.MjModel:
         """The compiled MuJoCo model."""
         return self._simulator.host
 
@@ -148,8 +151,7 @@ def _fit_together(
         JointSimulator(Simulator(model, unmoved, grid, refine), selected, condition)
         for refine in (1, 2)
     )
-    shared = dataclasses.replace(model, effects=(*model.effects, *selected[0]))
-    _, segments = choose_horizon(Simulator(shared, (), grid), everything, grid)
+    _, segments = choose_horizon(joint, everything, grid)
     fitted = np.ones(len(segments.start), bool)
     problem = Problem(joint, finer, segments, fitted, grid.interval * grid.per_sample)
     candidates = [c for d in diagnoses for c in d.selected]

@@ -14,8 +14,6 @@ CONTENDERS = 4
 HOPELESS = 8.0
 """What a candidate is expected to leave unexplained, relative to what the best one left when it was
 fitted, above which it is not fitted; the runner-up always is."""
-CONTENDER_STEPS = 12
-"""Gauss-Newton steps of a contender, which starts where screening expects it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,10 +67,16 @@ def fit_refinements(
 ) -> list[Contender]:
     """Fit the laws that refine the best contender's at its place, from where they are alike.
 
-    That something acts there is the simpler law's evidence, which they take over.
+    That something acts there is the simpler law's evidence, which they take over. A law that acted
+    before it was fitted is left as it is.
     """
     effects = problem.simulator.effects
     simple = effects[best.score.effect]
+    none = simple.at(problem.simulator.host, simple.target)
+    slots = enumerate(problem.simulator.slots)
+    own = {slot.parameter.name: j for j, slot in slots if slot.effect == best.score.effect}
+    if any(current.theta[j] != none[name] for name, j in own.items()):
+        return []
     values = problem.simulator.with_parameters([float(v) for v in best.fit.theta])
     rival = best.fit.cost[problem.fitted].sum()
     contenders = []
@@ -81,6 +85,8 @@ def fit_refinements(
         if law.target != simple.target or simple.kind not in law.refines:
             continue
         alike = type(law).refined_from(values[best.score.effect])
+        if not alike:
+            continue
         columns = {
             slot.parameter.name: j
             for j, slot in enumerate(problem.simulator.slots)
@@ -101,5 +107,6 @@ def _fit(problem: Problem, current: Fit, score: Score, rival: float, say) -> Con
     theta = current.theta.copy()
     theta[list(score.start)] = list(score.start.values())
     free = (*current.free, *score.columns)
-    fitted = fit(problem, theta, current.start, free, CONTENDER_STEPS, rival, current.sensitivity)
+    start, sensitivity = current.start, current.sensitivity
+    fitted = fit(problem, theta, start, free, rival=rival, sensitivity=sensitivity)
     return Contender(score, fitted)

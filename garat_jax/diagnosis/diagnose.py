@@ -13,7 +13,7 @@ from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, signals
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.problem import Predictor, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import Segments, choose_grid, cut, nearby_starts
@@ -140,7 +140,7 @@ def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
     return tuple(candidates)
 
 
-def choose_horizon(simulator: Simulator, recordings, grid) -> tuple[float, Segments]:
+def choose_horizon(simulator: Predictor, recordings, grid) -> tuple[float, Segments]:
     """Choose the longest horizon over which fits are nearly linear, and cut there.
 
     Growth is the change of the signals after a small change of the initial state, both relative to

@@ -7,8 +7,6 @@ import numpy as np
 from garat_jax.diagnosis.fit import Fit
 from garat_jax.diagnosis.problem import Problem, StartSpace
 
-NOTHING_BUT_NOISE = 2.0
-"""Spread of a signal, in standard deviations of its noise, up to which it says nothing."""
 ABOVE_FLOOR = 1.5
 """A model is adequate up to this multiple of the noise floor."""
 
@@ -17,8 +15,7 @@ class Metric(NamedTuple):
     """The error that is reported: see `results.Errors`.
 
     Attributes:
-        weight: Squared metric of one squared whitened residual, [N]; 0 of signals that hold nothing
-            but noise, unless all do.
+        weight: Squared metric of one squared whitened residual, [N].
         counted: Which residuals are samples and not padding, [S, N].
         spread: Standard deviation of each signal in the held-out data, [num_signals].
     """
@@ -33,8 +30,8 @@ class Metric(NamedTuple):
         return float(np.sqrt(squares.sum() / self.count(chosen)))
 
     def count(self, chosen: np.ndarray) -> int:
-        """Return how many samples of signals with a weight the chosen segments have."""
-        return max(int(self.counted[chosen][:, self.weight > 0].sum()), 1)
+        """Return how many residuals of the chosen segments count, 1 or more."""
+        return max(int(self.counted[chosen].sum()), 1)
 
     def by_signal(self, residual: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Return the error of each signal in units of its noise, [num_signals]."""
@@ -48,9 +45,7 @@ def make_metric(problem: Problem) -> Metric:
     s = problem.segments
     held_out = (s.weight > 0) & ~problem.fitted[:, None]
     spread = s.measured[held_out].std(axis=0) + 1e-12
-    moves = spread > NOTHING_BUT_NOISE * s.noise
-    weight = np.where(moves | ~moves.any(), (s.noise / spread) ** 2, 0.0)
-    weight = np.tile(weight, s.measured.shape[1])
+    weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
     return Metric(weight, np.repeat(s.weight > 0, s.measured.shape[2], axis=1), spread)
 
 

@@ -25,7 +25,7 @@ SIGNIFICANCE = 0.01
 """Largest corrected p-value."""
 STABLE = 0.8
 """Share of block resamples in which an effect must be first."""
-WORTH_REFINING = 1.1
+REFINED_ABOVE = 1.1
 """Multiple of the noise floor above which refinements of the best law are tried."""
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
@@ -74,9 +74,9 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         start: Initial states to start from, [S, nq + nv].
         say: Told what is being done.
     """
-    metric = make_metric(problem)
     say("the model as it is")
     before = settle(problem, problem.simulator.base, start)
+    metric = make_metric(problem)
     floor = noise_floor(problem, metric, before)
     adequate = not is_above(problem, metric, before, floor)
     current, steps, first_round, best = before, [], (), None
@@ -117,13 +117,10 @@ def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Fl
     if not contenders:
         return contenders
     best = min(contenders, key=lambda c: c.fit.cost.sum())
-    if not is_above(problem, metric, best.fit, floor, WORTH_REFINING):
+    if not is_above(problem, metric, best.fit, floor, REFINED_ABOVE):
         return contenders
     for contender in fit_refinements(problem, current, best, scores, say):
-        costs = _block_costs(problem, 1.0, [best.fit, contender.fit], slice(None))
-        drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
-        lead = drawn[:, 0] - drawn[:, 1]
-        if np.quantile(lead, 0.025) > 0 and np.median(lead) > np.log(TOO_CLOSE):
+        if _leads(problem, contender.fit, best.fit):
             replaced = (best.score.effect, contender.score.effect)
             others = (c for c in contenders if c.score.effect not in replaced)
             contenders, best = [contender, *others], contender
@@ -134,6 +131,14 @@ def _block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fi
     """Return each fit's cost in each block of the chosen segments, [num_fits, num_blocks]."""
     labels = np.unique(block_labels(problem)[chosen].ravel(), return_inverse=True)[1]
     return np.stack([np.bincount(labels, (f.residual[chosen] ** 2 * weight).ravel()) for f in fits])
+
+
+def _leads(problem: Problem, first: Fit, second: Fit) -> bool:
+    """Say whether one fit's cost is certainly lower than another's, by more than a trifle."""
+    costs = _block_costs(problem, 1.0, [first, second], slice(None))
+    drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
+    lead = drawn[:, 1] - drawn[:, 0]
+    return bool(np.quantile(lead, 0.025) > 0 and np.median(lead) > np.log(TOO_CLOSE))
 
 
 def _resamples(num_blocks: int) -> np.ndarray:
@@ -295,10 +300,7 @@ def _prune(problem: Problem, before: Fit, steps: list[Step], current: Fit, say):
         say(f"trying without {step.candidate.named}")
         others = [s.effect for s in kept if s.effect != step.effect]
         without = _fit_only(problem, current, others, current.cost[problem.fitted].sum())
-        costs = _block_costs(problem, 1.0, [without, current], slice(None))
-        drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
-        lead = drawn[:, 0] - drawn[:, 1]
-        if np.quantile(lead, 0.025) <= 0 or np.median(lead) < np.log(TOO_CLOSE):
+        if not _leads(problem, current, without):
             kept = [other for other in kept if other.effect != step.effect]
             current = without
     if len(kept) == len(steps):

@@ -203,7 +203,8 @@ class Diagnosis:
 
     `conditions` holds the diagnoses of recordings made under other conditions, in which the model
     has the effects that were selected here; one of the same kind and place replaces it there. The
-    parameters of `selected` then fit all conditions together.
+    parameters of `selected` then fit all conditions together, save those that stay unexplained;
+    errors and candidates are of each condition by itself.
     """
 
     model: str

@@ -26,10 +26,11 @@ from garat_jax.diagnosis.problem import (
 )
 from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.effects import Effect
 
 EQUIVALENT = 0.95
 """Cosine of two candidates' contributions above which the recordings cannot tell them apart."""
-WORTH_REFINING = 0.8
+WORTH_A_REFINEMENT = 0.8
 """Share of what a simpler law leaves unexplained that a refinement of it must get below."""
 SCREENED = 24
 """Segments that are screened at least, evenly chosen; scores take many simulations each."""
@@ -162,7 +163,7 @@ def simpler_law(problem: Problem, score: Score, scores: Sequence[Score]) -> Scor
     for other in scores:
         simpler = problem.simulator.effects[other.effect]
         is_simpler = simpler.target == effect.target and simpler.kind in effect.refines
-        if is_simpler and 1 - score.share > WORTH_REFINING * (1 - other.share):
+        if is_simpler and 1 - score.share > WORTH_A_REFINEMENT * (1 - other.share):
             return other
     return None
 
@@ -182,7 +183,7 @@ def _firsts(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], 
         if index in skip or not columns:
             continue
         names = {simulator.slots[j].parameter.name: j for j in columns}
-        starts = effect.starts(simulator.host, effect.target)
+        starts = _sizes(simulator, theta, effect, columns)
         for given in starts:
             start = {names[name]: value for name, value in given.items()}
             if len(starts) == 1 and len(start) == 1:
@@ -192,6 +193,18 @@ def _firsts(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], 
             trials.append(_Trial(index, start, (len(rows),), len(starts) == 1))
             rows.append(_Row(moved, start, start[moved] - theta[moved], -1))
     return rows, trials
+
+
+def _sizes(simulator: Simulator, theta: np.ndarray, effect: Effect, columns: list[int]):
+    """Return the sizes at which to try an effect; half and twice its size where it acts already."""
+    starts = effect.starts(simulator.host, effect.target)
+    none = effect.at(simulator.host, effect.target)
+    slots = [simulator.slots[j].parameter for j in columns]
+    acts = any(theta[j] != none[p.name] for j, p in zip(columns, slots, strict=True))
+    if len(starts) == 1 or not acts:
+        return starts
+    first, size = slots[0], float(theta[columns[0]])
+    return tuple({first.name: min(factor * size, first.high)} for factor in (0.5, 2.0))
 
 
 def _best_sizes(trials: list[_Trial], changes: np.ndarray, residual: np.ndarray) -> list[_Trial]:

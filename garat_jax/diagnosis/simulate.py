@@ -1,7 +1,7 @@
 """Simulate every segment of the recordings, for many parameters and initial states, in one call.
 
-One compiled model holds every candidate effect at its nominal value, which is the identity; fitting
-and scoring move its leaves.
+One compiled model holds every candidate effect at its nominal value, which is the identity, or at
+the size that it has already; fitting and scoring move its leaves.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ class Slot(NamedTuple):
     Attributes:
         effect: Index among the candidate effects.
         parameter: Its declaration.
-        base: The value that stands for "no effect" here.
+        base: The value to begin with: "no effect" here, or what the effect has already.
     """
 
     effect: int
@@ -63,7 +63,7 @@ class Simulator:
     Attributes:
         effects: The candidate effects; the model's own effects stay as they are.
         slots: The candidate effects' parameters, in the order of `theta`.
-        base: `theta` at which no candidate acts, [num_parameters].
+        base: `theta` at which no candidate acts but those that did before, [num_parameters].
     """
 
     def __init__(

@@ -234,12 +234,13 @@ class Effect(abc.ABC):
 
     @classmethod
     def refined_from(cls, simpler: "Effect") -> Mapping[str, float]:
-        """Return parameters near which this law is like a simpler one that it refines.
+        """Return parameters near which this law is like one that it refines; none if unknown.
 
         Args:
             simpler: An effect of a kind in `refines`, with values.
         """
-        raise NotImplementedError(f"{cls.kind} refines no {simpler.kind}")
+        del simpler
+        return {}
 
     def export(self, spec: mujoco.MjSpec) -> str:
         """Write the effect into a spec as plain MJCF, as far as MJCF can say it.

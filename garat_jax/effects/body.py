@@ -70,7 +70,9 @@ class PayloadMass(Effect):
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
         """Try a light and a heavy payload: the response to a heavy one is no multiple."""
         carried = float(host.body_subtreemass[host.body(target.partition("/")[2]).id])
-        return tuple({"mass": share * max(carried, SMALLEST_MASS)} for share in PAYLOADS)
+        mass = cls.parameters()[0]
+        sizes = (share * max(carried, SMALLEST_MASS) for share in PAYLOADS)
+        return tuple({mass.name: min(size, mass.high)} for size in sizes)
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Weld a body of negligible mass to the target, which the compiler may not fuse."""

@@ -2,13 +2,16 @@
 
 import dataclasses
 import functools
+from typing import cast
 
+import numpy as np
 import pytest
 
 from garat_jax.cli import main
-from garat_jax.diagnosis.conditions import diagnose_conditions
-from garat_jax.diagnosis.diagnose import diagnose
-from garat_jax.effects import CATALOGUE
+from garat_jax.diagnosis.conditions import JointSimulator, diagnose_conditions
+from garat_jax.diagnosis.segments import Segments
+from garat_jax.diagnosis.simulate import Simulator, Slot
+from garat_jax.effects import CATALOGUE, TorqueOffset, ViscousDamping
 from tests import models
 from tests.diagnosis.pendulum import MODEL, add_damping, add_payload, record
 
@@ -53,14 +56,51 @@ def test_all_conditions_size_a_shared_effect_and_each_sizes_its_own():
 
     base = [record(add_damping, seed) for seed in range(3)]
     found = diagnose_conditions(model, base, {"loaded": [record(loaded, s) for s in (3, 4, 5)]})
-    alone = diagnose(model, base)
     (payload,) = found.conditions["loaded"].selected
     assert payload.effect == "payload_mass"
     assert payload.parameters["mass"].estimate == pytest.approx(0.1, rel=0.05)
     assert payload.parameters["z"].estimate == pytest.approx(-0.4, abs=0.01)
-    before, after = (d.selected[0].parameters["coefficient"] for d in (alone, found))
-    assert after.estimate != before.estimate
-    assert after.low < 0.02 < after.high
+    shared = found.selected[0].parameters["coefficient"]
+    assert shared.low < 0.02 < shared.high
+
+
+def test_a_shared_payload_may_be_heavier_under_a_condition():
+    model = dataclasses.replace(MODEL, catalogue={"payload_mass": CATALOGUE["payload_mass"]})
+    one, three = (functools.partial(add_payload, mass=m, x=0.0, z=-0.4) for m in (0.4, 1.2))
+    base = [record(one, seed) for seed in range(3)]
+    found = diagnose_conditions(model, base, {"more": [record(three, s) for s in (3, 4, 5)]})
+    masses = [d.selected[0].parameters["mass"] for d in (found, found.conditions["more"])]
+    assert [m.estimate for m in masses] == pytest.approx([0.4, 1.2], rel=0.05)
+
+
+class Echo:
+    """Stands for a simulator, and predicts each segment's parameters."""
+
+    effects = (ViscousDamping("joint/hinge"), TorqueOffset("joint/hinge"))
+    slots = tuple(Slot(i, e.parameters()[0], 0.0) for i, e in enumerate(effects))
+    base = np.zeros(2)
+    host = None
+
+    def predict(self, theta, start, segments):
+        return np.broadcast_to(theta[:, None, None, :], (len(theta), *segments.measured.shape))
+
+
+def test_each_condition_is_simulated_with_what_is_shared_and_what_is_its_own():
+    damping, offset = Echo.effects
+    selected = [(damping.replace(coefficient=1.0),), (damping.replace(coefficient=2.0),)]
+    selected.append((offset.replace(torque=3.0),))
+    joint = JointSimulator(cast(Simulator, Echo()), selected, np.asarray([0, 0, 1, 2]))
+    np.testing.assert_array_equal(joint.base, [1.0, 2.0, 3.0])
+    many = np.zeros(4)
+    segments = Segments(
+        measured=np.zeros((4, 1, 2)),
+        recording=np.arange(4),
+        **dict.fromkeys(("weight", "start", "ctrl", "place", "first", "noise", "spread"), many),
+    )
+    theta = np.stack([joint.base, 10 * joint.base])
+    predicted = joint.predict(theta, np.zeros((2, 4, 2)), segments)
+    np.testing.assert_array_equal(predicted[0, :, 0], [[1, 0], [1, 0], [2, 0], [1, 3]])
+    np.testing.assert_array_equal(predicted[1], 10 * predicted[0])
 
 
 def test_a_condition_without_a_file_is_refused(tmp_path, capsys):
