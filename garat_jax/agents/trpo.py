@@ -30,7 +30,7 @@ class TRPOConfig:
     trace: float = 0.97
     cg_damping: float = 0.1
     cg_iterations: int = 20
-    fisher_share: float = 0.2  # of the batch; stable-baselines TRPO: every fifth sample
+    fisher_share: float = 1.0  # of the batch; stable-baselines TRPO takes every fifth sample
     line_search_steps: int = 10  # stable-baselines TRPO
     value_learning_rate: float = 1e-3
     value_epochs: int = 5
