@@ -17,7 +17,8 @@ class Metric(NamedTuple):
     Attributes:
         weight: Squared metric of one squared whitened residual, [N].
         counted: Which residuals are samples and not padding, [S, N].
-        spread: Standard deviation of each signal in the held-out data, [num_signals].
+        spread: Standard deviation of each signal in the held-out data, its noise at least,
+            [num_signals].
     """
 
     weight: np.ndarray
@@ -44,7 +45,7 @@ def make_metric(problem: Problem) -> Metric:
     """Make the metric: errors relative to each signal's spread in the held-out data."""
     s = problem.segments
     held_out = (s.weight > 0) & ~problem.fitted[:, None]
-    spread = s.measured[held_out].std(axis=0) + 1e-12
+    spread = np.maximum(s.measured[held_out].std(axis=0), s.noise)
     weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
     return Metric(weight, np.repeat(s.weight > 0, s.measured.shape[2], axis=1), spread)
 

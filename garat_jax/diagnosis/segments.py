@@ -20,6 +20,8 @@ SHORTEST = 10
 """Samples that a segment must have."""
 SMALLEST_NOISE = 1e-4
 """Noise assumed at least, relative to the signal's standard deviation."""
+UNKNOWN_NOISE = 1e-6
+"""Noise assumed where no signal of a kind ever changes, in the signals' units."""
 KINEMATIC_WINDOW = 0.05
 """Seconds over which position and velocity sensors are held against each other."""
 CONTRADICTION = 1.5
@@ -39,7 +41,7 @@ class Segments:
         recording: Index of the recording, [S].
         first: Index of the first sample within its recording, [S].
         noise: Standard deviation of each signal's noise, [num_signals].
-        spread: Standard deviation of each signal, [num_signals].
+        spread: Standard deviation of each signal, its noise at least, [num_signals].
     """
 
     measured: np.ndarray
@@ -127,7 +129,11 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     num_signals = measured.shape[2] if measured_velocity else num_position
     deviations = np.sqrt(np.mean([signal_noise(r) ** 2 for r in recordings], axis=0))
     measured = measured[..., :num_signals]
-    spread = measured[weight > 0].std(axis=0) + 1e-12
+    spread = measured[weight > 0].std(axis=0)
+    deviations = np.maximum(deviations[:num_signals], SMALLEST_NOISE * spread)
+    is_still = np.ptp(measured[weight > 0], axis=0) == 0
+    for kind in (slice(num_position), slice(num_position, num_signals)):
+        deviations[kind] = _noise_of_still(deviations[kind], is_still[kind])
     return Segments(
         measured=measured,
         weight=weight,
@@ -136,9 +142,15 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         place=place,
         recording=np.asarray([i for i, _, _ in pieces]),
         first=np.asarray([a for _, a, _ in pieces]),
-        noise=np.maximum(deviations[:num_signals], SMALLEST_NOISE * spread),
-        spread=spread,
+        noise=deviations,
+        spread=np.maximum(spread, deviations),
     )
+
+
+def _noise_of_still(noise: np.ndarray, is_still: np.ndarray) -> np.ndarray:
+    """Give signals that never change, whose encoders hide their noise, the most of their kind."""
+    most = noise[~is_still].max(initial=0.0) or UNKNOWN_NOISE
+    return np.where(is_still, most, noise)
 
 
 def warm_up_steps(grid: Grid, num_actuators: int) -> int:

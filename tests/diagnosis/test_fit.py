@@ -167,3 +167,20 @@ def test_passive_recordings_are_thinned_and_driven_ones_are_not():
     assert len(thin([passive])[0].time) == 50
     assert thin([passive])[0].spans == ((0, 50),)
     assert len(thin([fast])[0].time) == 100
+
+
+def test_a_signal_that_never_changes_has_the_noise_of_its_kind():
+    rng = np.random.default_rng(0)
+    swinging = np.sin(9 * UNIFORM) + 1e-3 * rng.normal(size=len(UNIFORM))
+    speed = 9 * np.cos(9 * UNIFORM) + 1e-2 * rng.normal(size=len(UNIFORM))
+    still = np.full(len(UNIFORM), 0.25)
+    recording = dataclasses.replace(
+        record(UNIFORM),
+        qpos=np.column_stack([swinging, still]),
+        qvel=np.column_stack([speed, 0.0 * still]),
+    )
+    segments = cut([recording], choose_grid([recording], 0.002), 0.4)
+    assert segments.noise[0] == pytest.approx(1e-3, rel=0.2)
+    assert segments.noise[2] == pytest.approx(1e-2, rel=0.2)
+    np.testing.assert_array_equal(segments.noise[[1, 3]], segments.noise[[0, 2]])
+    np.testing.assert_array_equal(segments.spread[[1, 3]], segments.noise[[1, 3]])
