@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import tyro
-from record import RESULTS, write_result
+from record import RESULTS, command_line, write_result
 from speed import ours
 from speed.ours import Size
 from speed.sides import RANDOM, measure
@@ -81,16 +81,12 @@ def main() -> None:
         rows += grow(name, "envs", by_envs, arguments)
         rows += grow(name, "seeds", by_seeds, arguments)
     backend = jax.default_backend()
-    command = (
-        f"python benchmarks/growth.py --envs {' '.join(arguments.envs)} "
-        f"--repetitions {arguments.repetitions}"
-    )
     print(
         write_result(
             "growth" if backend == "cpu" else f"growth_{backend}",
             rows,
             seeds=list(range(max(arguments.num_seeds))),
-            command=command,
+            command=command_line(),
             details={"device": jax.devices()[0].device_kind},
             folder=arguments.out,
         )

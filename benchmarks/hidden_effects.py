@@ -9,8 +9,6 @@ import argparse
 import concurrent.futures
 import json
 import multiprocessing
-import shlex
-import sys
 import tempfile
 import time
 import traceback
@@ -21,7 +19,7 @@ from typing import Any
 from hidden import score
 from hidden.generate import Case, Surveys, Truth, draw, generate, list_cases
 from hidden.robots import ROBOTS
-from record import write_result
+from record import command_line, write_result
 
 from garat_jax.diagnosis import diagnose, load_model
 from garat_jax.diagnosis.compare import read_recordings
@@ -141,7 +139,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder of rows.jsonl")
     parser.add_argument("--timing", action="store_true", help="time garat beside mujoco.sysid")
     arguments = parser.parse_args()
-    command = shlex.join(["python", "benchmarks/hidden_effects.py", *sys.argv[1:]])
+    command = command_line()
     if arguments.timing:
         from hidden import timing
 

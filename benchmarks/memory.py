@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from record import RESULTS, write_result
+from record import RESULTS, command_line, write_result
 
 from garat_jax import compilation_cache
 
@@ -97,10 +97,7 @@ def main() -> None:
 
     rows = [measure(pair, arguments) for pair in arguments.pairs or PAIRS]
     seeds = list(range(arguments.seeds))
-    command = "python benchmarks/memory.py"
-    if arguments.pairs:
-        command += f" --pairs {' '.join(arguments.pairs)}"
-    print(write_result("memory", rows, seeds=seeds, command=command, folder=arguments.out))
+    print(write_result("memory", rows, seeds=seeds, command=command_line(), folder=arguments.out))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 
 import datetime
 import json
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,3 +57,12 @@ def write_result(
     path = folder / f"{name}.json"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def command_line() -> str:
+    """Return the command that makes the rows again, without where they are to go."""
+    words = sys.argv[1:]
+    if "--out" in words:
+        place = words.index("--out")
+        words = words[:place] + words[place + 2 :]
+    return shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words])

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from record import RESULTS, write_result
+from record import RESULTS, command_line, write_result
 
 from garat_jax import compilation_cache
 
@@ -153,9 +153,12 @@ def main() -> None:
     rows = [
         measure(name, cache, arguments) for name in arguments.envs for cache in arguments.caches
     ]
-    command = f"python benchmarks/seeds_together.py --repetitions {arguments.repetitions}"
     seeds = list(range(arguments.seeds))
-    print(write_result("seeds_together", rows, seeds=seeds, command=command, folder=arguments.out))
+    print(
+        write_result(
+            "seeds_together", rows, seeds=seeds, command=command_line(), folder=arguments.out
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import tyro
-from record import RESULTS, write_result
+from record import RESULTS, command_line, write_result
 from speed import ours
 from speed.ours import Size
 from speed.parts import parts
@@ -127,10 +127,6 @@ def main() -> None:
             found += more
     backend = jax.default_backend()
     name = "throughput" if backend == "cpu" else f"throughput_{backend}"
-    command = (
-        f"python benchmarks/throughput.py --envs {' '.join(arguments.envs)} "
-        f"--repetitions {arguments.repetitions}"
-    )
     details = {
         "device": jax.devices()[0].device_kind,
         "load_average_after": os.getloadavg(),
@@ -140,7 +136,7 @@ def main() -> None:
     seeds = list(range(5))
     print(
         write_result(
-            name, rows, seeds=seeds, command=command, details=details, folder=arguments.out
+            name, rows, seeds=seeds, command=command_line(), details=details, folder=arguments.out
         )
     )
 

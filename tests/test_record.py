@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.record import write_result
+from benchmarks.record import command_line, write_result
 
 
 def test_a_result_names_what_is_needed_to_get_it_again(tmp_path):
@@ -24,3 +24,9 @@ def test_a_result_without_a_value_is_refused(tmp_path, rows):
     with pytest.raises(ValueError):
         write_result("speed", rows, seeds=[0], command="python x.py", folder=tmp_path)
     assert not (tmp_path / "speed.json").exists()
+
+
+def test_the_command_is_recorded_without_where_the_result_goes(monkeypatch):
+    words = ["/somewhere/benchmarks/speed.py", "--out", "/elsewhere", "--envs", "hopper"]
+    monkeypatch.setattr("sys.argv", words)
+    assert command_line() == "python benchmarks/speed.py --envs hopper"

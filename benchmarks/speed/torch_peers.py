@@ -182,11 +182,11 @@ def sides(
 ) -> tuple[list[Side], list[dict[str, Any]]]:
     """Return each peer at its best in a world, and what all the choices gave.
 
-    A peer is a side twice: at its best in our world, and at its best in Gymnasium's own.
+    A peer is a side twice: at its best in our world, and in Gymnasium's own where it has the world.
     """
     tried: list[dict[str, Any]] = []
     learners: dict[tuple[str, Choice], Any] = {}
-    for stepped, num_envs in _sizes():
+    for stepped, num_envs in _sizes(env_name):
         envs = make_envs(env_name, world, stepped, num_envs)
         for algorithm in algorithms:
             library, make_learner = LEARNERS[algorithm]
@@ -214,6 +214,8 @@ def sides(
                 if row["agent"] == f"{library} {algorithm}"
                 and (row["stepped"] == NATIVE) == is_native
             ]
+            if not rows:
+                continue
             best = max(rows, key=lambda row: row["steps_per_second"])
             choice = Choice(best["stepped"], best["num_envs"], best["num_threads"])
             found.append(
@@ -222,8 +224,10 @@ def sides(
     return found, tried
 
 
-def _sizes() -> Iterator[tuple[str, int]]:
+def _sizes(env_name: str) -> Iterator[tuple[str, int]]:
     for stepped, numbers in NUM_ENVS.items():
+        if stepped == NATIVE and env_name not in GYMNASIUM:
+            continue
         for num_envs in numbers:
             yield stepped, num_envs
 
