@@ -65,7 +65,7 @@ def fit_refinements(
     scores: Sequence[Score],
     say: Callable[[str], None],
 ) -> list[Contender]:
-    """Fit the laws that refine the best contender's at its place, from where they are alike.
+    """Fit the laws that refine the best contender's at its place and that screening may not see.
 
     That something acts there is the simpler law's evidence, which they take over. A law that acted
     before it was fitted is left as it is.

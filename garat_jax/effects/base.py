@@ -234,7 +234,9 @@ class Effect(abc.ABC):
 
     @classmethod
     def refined_from(cls, simpler: "Effect") -> Mapping[str, float]:
-        """Return parameters near which this law is like one that it refines; none if unknown.
+        """Return parameters near which this law is like one that it refines.
+
+        Only a law that shows beyond a threshold needs them, because screening may not see it.
 
         Args:
             simpler: An effect of a kind in `refines`, with values.

@@ -182,13 +182,6 @@ class AsymmetricFriction(Effect):
         source="As viscous_damping",
     )
 
-    @classmethod
-    def refined_from(cls, simpler: Effect) -> Mapping[str, float]:
-        """Begin with the same friction in both directions."""
-        name = simpler.kind.partition("_")[0]
-        size = float(getattr(simpler, simpler.parameters()[0].name))
-        return {f"{name}_positive": size, f"{name}_negative": size}
-
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Make the compiler reserve the friction constraint's row."""
         reserve_row(spec, self.name)
