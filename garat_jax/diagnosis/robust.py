@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
 CONDITION = 1e-9
 """Eigenvalue of the normal matrix of unit columns, relative to the largest, that counts as zero."""
@@ -46,3 +47,45 @@ def regress(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray) -> Re
     freedom = max(num_blocks - len(unit), 1)
     covariance = bread @ (scores.T @ scores) @ bread * (num_blocks / freedom)
     return Regression(coefficient / unit, covariance / np.outer(unit, unit), rest, freedom)
+
+
+def wald_test(
+    matrix: np.ndarray, residual: np.ndarray, nuisance: np.ndarray, labels: np.ndarray
+) -> float:
+    """Return the p-value of a robust test that all of the columns' coefficients are 0.
+
+    Args:
+        matrix: Columns, [M, k].
+        residual: [M].
+        nuisance: Orthonormal columns that are projected out first, [M, n].
+        labels: The block of each residual, integers, [M].
+    """
+    unit = np.linalg.norm(matrix, axis=0)
+    matrix, residual = (
+        without(matrix / unit, nuisance),
+        residual - nuisance @ (nuisance.T @ residual),
+    )
+    norm = np.linalg.norm(matrix, axis=0)
+    matrix = matrix[:, norm > 1e-6]
+    if matrix.shape[1] == 0:
+        return 1.0
+    found = regress(matrix, residual, labels)
+    num = matrix.shape[1]
+    precision = np.linalg.pinv(found.covariance, hermitian=True)
+    statistic = float(found.coefficient @ precision @ found.coefficient) / num
+    return float(stats.f.sf(statistic, num, found.freedom))
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis of columns [M, k] without the directions that are zero."""
+    scale = np.linalg.norm(columns, axis=0)
+    columns = columns[:, scale > 0] / scale[scale > 0]
+    if columns.shape[1] == 0:
+        return columns
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, s > 1e-6 * s[0]]
+
+
+def without(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return columns [M, k] less their parts along an orthonormal basis [M, n]."""
+    return columns - basis @ (basis.T @ columns)

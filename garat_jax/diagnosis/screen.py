@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from garat_jax.diagnosis.fit import Fit
 from garat_jax.diagnosis.problem import (
@@ -24,7 +23,7 @@ from garat_jax.diagnosis.problem import (
     linearise,
     tall,
 )
-from garat_jax.diagnosis.robust import regress
+from garat_jax.diagnosis.robust import orthonormal, wald_test, without
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.effects import Effect
 
@@ -298,25 +297,11 @@ class _Remover:
 
     def __init__(self, lin: Linearisation):
         self._space = StartSpace(lin.start)
-        self._free = _orthonormal(tall(self._space.remove(lin.parameters)))
+        self._free = orthonormal(tall(self._space.remove(lin.parameters)))
 
     def __call__(self, columns: np.ndarray) -> np.ndarray:
         rest = self._space.remove(np.moveaxis(columns, 0, -1))
-        return _without(tall(rest), self._free)
-
-
-def _orthonormal(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis of columns [M, k] without the directions that are zero."""
-    scale = np.linalg.norm(columns, axis=0)
-    columns = columns[:, scale > 0] / scale[scale > 0]
-    if columns.shape[1] == 0:
-        return columns
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, s > 1e-6 * s[0]]
-
-
-def _without(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    return columns - basis @ (basis.T @ columns)
+        return without(tall(rest), self._free)
 
 
 def _score(problem: Problem, s: _Sensitivities, rows: list[_Row], trial: _Trial) -> Score:
@@ -346,7 +331,7 @@ def _score(problem: Problem, s: _Sensitivities, rows: list[_Row], trial: _Trial)
     nuisances = [s.integrator]
     nuisances += [] if kind in DELAYS else [s.delay]
     nuisances += [] if kind in OFFSETS else [s.offsets]
-    p_value = _wald(matrix, s.residual, _orthonormal(np.concatenate(nuisances, 1)), s.labels)
+    p_value = wald_test(matrix, s.residual, orthonormal(np.concatenate(nuisances, 1)), s.labels)
     columns = tuple(rows[i].column for i in chosen)
     return Score(trial.effect, columns, size, start, share, p_value, possible, contribution)
 
@@ -377,9 +362,9 @@ def _needed(matrix: np.ndarray, residual: np.ndarray, seen: np.ndarray, given) -
     """Return the given columns and, one by one, those that explain a worthwhile part more."""
     chosen, others = list(given), [i for i in range(len(seen)) if seen[i] and i not in given]
     while others:
-        basis = _orthonormal(matrix[:, chosen])
-        rest = _without(residual[:, None], basis)[:, 0]
-        fresh = _without(matrix[:, others], basis)
+        basis = orthonormal(matrix[:, chosen])
+        rest = without(residual[:, None], basis)[:, 0]
+        fresh = without(matrix[:, others], basis)
         norm = np.linalg.norm(fresh, axis=0)
         gain = (fresh.T @ rest / np.maximum(norm, 1e-300)) ** 2 * (norm > 1e-6 * norm.max())
         best = int(np.argmax(gain))
@@ -387,21 +372,3 @@ def _needed(matrix: np.ndarray, residual: np.ndarray, seen: np.ndarray, given) -
             break
         chosen.append(others.pop(best))
     return chosen
-
-
-def _wald(matrix, residual, nuisance, labels) -> float:
-    """Return the p-value of a robust test that all of the columns' coefficients are 0."""
-    unit = np.linalg.norm(matrix, axis=0)
-    matrix, residual = (
-        _without(matrix / unit, nuisance),
-        residual - nuisance @ (nuisance.T @ residual),
-    )
-    norm = np.linalg.norm(matrix, axis=0)
-    matrix = matrix[:, norm > 1e-6]
-    if matrix.shape[1] == 0:
-        return 1.0
-    found = regress(matrix, residual, labels)
-    num = matrix.shape[1]
-    precision = np.linalg.pinv(found.covariance, hermitian=True)
-    statistic = float(found.coefficient @ precision @ found.coefficient) / num
-    return float(stats.f.sf(statistic, num, found.freedom))
