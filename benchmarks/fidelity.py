@@ -124,19 +124,22 @@ def begin(world: World, seed: int) -> Start:
     """
     host = world.params.host.model
     has_contacts = bool(host.geom_contype.any() and host.geom_conaffinity.any())
-    reset_key, key = jax.random.split(jax.random.key(seed))
+    reset_key, action_key, ctrl_key = jax.random.split(jax.random.key(seed), 3)
 
     def run(key: jax.Array, actions: jax.Array):
-        def step(carry, action):
-            state, up = carry
+        keys = jax.random.split(key, EPISODE + 1)
+
+        def step(carry, inputs):
+            (state, up), (action, key) = carry, inputs
             result = world.env.step(world.params, state, action, key)
             up = up & ~(result.terminated & has_contacts)
             return (result.state, up), (result.state.physics.qpos, result.state.physics.qvel, up)
 
-        return jax.lax.scan(step, (world.env.reset(world.params, key), jnp.asarray(True)), actions)
+        start = (world.env.reset(world.params, keys[0]), jnp.asarray(True))
+        return jax.lax.scan(step, start, (actions, keys[1:]))
 
     shape = (NUM_STATES, EPISODE, world.env.action_size)
-    actions = _uniform(key, shape, world)
+    actions = _uniform(action_key, shape, world)
     keys = jax.random.split(reset_key, NUM_STATES)
     _, found = jax.jit(jax.vmap(run))(keys, actions)
     qpos, qvel, up = (np.asarray(x).reshape(-1, *x.shape[2:]) for x in found)
@@ -145,7 +148,7 @@ def begin(world: World, seed: int) -> Start:
     if len(touching) < NUM_STATES:
         raise RuntimeError(f"only {len(touching)} of {len(up)} states are in contact")
     chosen = np.random.default_rng(seed).choice(touching, NUM_STATES, replace=False)
-    ctrl = np.asarray(_uniform(reset_key, (max(HORIZONS), NUM_STATES, host.nu), world))
+    ctrl = np.asarray(_uniform(ctrl_key, (max(HORIZONS), NUM_STATES, host.nu), world))
     exact = (x.astype(np.float32).astype(float) for x in (qpos[chosen], qvel[chosen], ctrl))
     return Start(*exact)
 
