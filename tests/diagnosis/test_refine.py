@@ -37,3 +37,15 @@ def test_constant_dry_friction_is_not_refined():
     (found,) = found_with(COULOMB, lambda speed: 0.0).selected
     assert found.effect == "coulomb_friction"
     assert found.parameters["torque"].estimate == pytest.approx(COULOMB, rel=0.05)
+
+
+def test_damping_with_a_little_dry_friction_is_not_called_asymmetric():
+    model = dataclasses.replace(MODEL, catalogue={kind: CATALOGUE[kind] for kind in KINDS})
+
+    def rub(spec):
+        spec.joint("hinge").damping[0] += 0.02
+        spec.joint("hinge").frictionloss = 0.01
+
+    found = diagnose(model, [record(rub, seed) for seed in range(4)])
+    assert found.selected[0].effect == "viscous_damping"
+    assert "asymmetric_friction" not in [c.effect for c in found.selected]
