@@ -8,6 +8,7 @@ import numpy as np
 from garat_jax.diagnosis.fit import Fit, fit
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, simpler_law
+from garat_jax.diagnosis.simulate import columns_of
 
 CONTENDERS = 4
 """How many candidates are fitted each round, besides those that are like the first."""
@@ -73,8 +74,7 @@ def fit_refinements(
     effects = problem.simulator.effects
     simple = effects[best.score.effect]
     none = simple.at(problem.simulator.host, simple.target)
-    slots = enumerate(problem.simulator.slots)
-    own = {slot.parameter.name: j for j, slot in slots if slot.effect == best.score.effect}
+    own = columns_of(problem.simulator.slots, best.score.effect)
     if any(current.theta[j] != none[name] for name, j in own.items()):
         return []
     values = problem.simulator.with_parameters([float(v) for v in best.fit.theta])
@@ -87,11 +87,7 @@ def fit_refinements(
         alike = type(law).refined_from(values[best.score.effect])
         if not alike:
             continue
-        columns = {
-            slot.parameter.name: j
-            for j, slot in enumerate(problem.simulator.slots)
-            if slot.effect == score.effect
-        }
+        columns = columns_of(problem.simulator.slots, score.effect)
         start = {columns[name]: value for name, value in alike.items()}
         score = dataclasses.replace(
             score, columns=tuple(columns.values()), start=start, p_value=best.score.p_value

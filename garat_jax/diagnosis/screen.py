@@ -24,7 +24,7 @@ from garat_jax.diagnosis.problem import (
     tall,
 )
 from garat_jax.diagnosis.robust import orthonormal, wald_test, without
-from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.simulate import Simulator, columns_of
 from garat_jax.effects import Effect
 
 EQUIVALENT = 0.95
@@ -178,10 +178,10 @@ def _firsts(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], 
     rows: list[_Row] = []
     trials = []
     for index, effect in enumerate(simulator.effects):
-        columns = [j for j, slot in enumerate(simulator.slots) if slot.effect == index]
+        names = columns_of(simulator.slots, index)
+        columns = list(names.values())
         if index in skip or not columns:
             continue
-        names = {simulator.slots[j].parameter.name: j for j in columns}
         starts = _sizes(simulator, theta, effect, columns)
         for given in starts:
             start = {names[name]: value for name, value in given.items()}
@@ -223,7 +223,7 @@ def _others(simulator: Simulator, theta: np.ndarray, rows: list[_Row], trials: l
     rows, extended = list(rows), []
     for trial in trials:
         first, effect = trial.rows[0], simulator.effects[trial.effect]
-        columns = [j for j, slot in enumerate(simulator.slots) if slot.effect == trial.effect]
+        columns = list(columns_of(simulator.slots, trial.effect).values())
         chosen = [first]
         for j in columns:
             if j == rows[first].column:

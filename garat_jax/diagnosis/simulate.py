@@ -41,6 +41,11 @@ class Slot(NamedTuple):
     base: float
 
 
+def columns_of(slots: Sequence[Slot], effect: int) -> dict[str, int]:
+    """Return where one candidate's parameters stand in `theta`, by their names."""
+    return {slot.parameter.name: j for j, slot in enumerate(slots) if slot.effect == effect}
+
+
 class Program(NamedTuple):
     """A compiled program.
 
