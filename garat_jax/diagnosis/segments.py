@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import integrate
+from scipy import integrate, optimize
 
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.errors import UserError
@@ -22,10 +22,10 @@ SMALLEST_NOISE = 1e-4
 """Noise assumed at least, relative to the signal's standard deviation."""
 UNKNOWN_NOISE = 1e-6
 """Noise assumed where no signal of a kind ever changes, in the signals' units."""
-KINEMATIC_WINDOW = 0.05
+KINEMATIC_WINDOWS = np.asarray([0.04, 0.06, 0.09, 0.13, 0.2, 0.3])
 """Seconds over which position and velocity sensors are held against each other."""
-CONTRADICTION = 1.5
-"""How much more than their white noise the two sensors must differ before it counts."""
+HELD_AGAINST = 0.05
+"""Seconds over which the velocities' error is averaged, of what grows with time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,31 +159,49 @@ def warm_up_steps(grid: Grid, num_actuators: int) -> int:
 
 
 def signal_noise(recording: Recording) -> np.ndarray:
-    """Estimate each signal's error, [nq + nv]: white noise, or sensors that contradict each other.
+    """Estimate each signal's error, [nq + nv], also where it is not white.
 
-    Filtered velocities have little white noise and are still wrong. What the change of position
-    over a short window differs from the integral of velocity, beyond white noise, is the
-    velocity's error. (Joints of one dof alone; a quaternion is no integral.)
+    Noise that changes slowly from sample to sample hides from `noise`, as do filtered velocities,
+    but position and velocity sensors then contradict each other. How far the change of a position
+    is from the integral of its velocity depends on the time in between: what does not grow with it
+    is the positions' error, what grows is the velocities'. (Joints of one dof alone; a quaternion
+    is no integral.)
     """
     white = np.asarray(noise(recording))
     num = recording.qpos.shape[1]
     if not recording.velocity_measured or num != recording.qvel.shape[1]:
         return white
-    changes = []
     interval = float(np.median(np.diff(recording.time)))
-    window = max(2, round(KINEMATIC_WINDOW / interval))
+    longest = max(b - a for a, b in recording.spans)
+    windows = np.unique(np.maximum(2, np.round(KINEMATIC_WINDOWS / interval).astype(int)))
+    windows = windows[windows < longest]
+    if len(windows) < 3:
+        return white
+    apart = _contradictions(recording, windows)
+    seconds = windows * interval
+    powers = np.stack([np.ones_like(seconds), seconds, seconds**2], axis=1)
+    error = white.copy()
+    for joint in range(num):
+        scale = np.maximum(apart[:, joint], 1e-300)
+        constant, walk, drift = optimize.nnls(powers / scale[:, None], np.ones(len(scale)))[0]
+        moving = walk / HELD_AGAINST + drift - white[num + joint] ** 2 * interval / HELD_AGAINST
+        error[joint] = max(white[joint], np.sqrt(constant / 2))
+        error[num + joint] = np.hypot(white[num + joint], np.sqrt(max(moving, 0.0)))
+    return error
+
+
+def _contradictions(recording: Recording, windows: np.ndarray) -> np.ndarray:
+    """Return the mean square of change of position less integrated velocity, [windows, nv]."""
+    apart = []
     for a, b in recording.spans:
         time, speed = recording.time[a:b], recording.qvel[a:b]
         travelled = integrate.cumulative_trapezoid(speed, time, axis=0, initial=0.0)
-        difference = recording.qpos[a:b] - travelled
-        changes.append(difference[window:] - difference[:-window])
-    duration = window * interval
-    apart = np.sqrt(np.mean(np.concatenate(changes) ** 2, axis=0)) / duration
-    expected = np.hypot(np.sqrt(2) * white[:num] / duration, white[num:] / np.sqrt(window))
-    systematic = np.sqrt(np.maximum(apart**2 - expected**2, 0.0))
-    contradicts = apart > CONTRADICTION * expected
-    return np.concatenate(
-        [white[:num], np.where(contradicts, np.hypot(white[num:], systematic), white[num:])]
+        apart.append(recording.qpos[a:b] - travelled)
+    return np.stack(
+        [
+            np.mean(np.concatenate([d[size:] - d[:-size] for d in apart]) ** 2, axis=0)
+            for size in windows
+        ]
     )
 
 

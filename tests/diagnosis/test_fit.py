@@ -5,6 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
+from scipy import signal
 
 from garat_jax.diagnosis.diagnose import make_candidates, split, thin
 from garat_jax.diagnosis.fit import fit, settle
@@ -149,6 +150,18 @@ def test_velocities_that_contradict_positions_count_as_noise():
     wrong = dataclasses.replace(right, qvel=speed + 0.1 * np.sin(3 * UNIFORM)[:, None])
     assert signal_noise(right)[1] < 0.01
     assert signal_noise(wrong)[1] == pytest.approx(0.1 / np.sqrt(2), rel=0.3)
+
+
+@pytest.mark.parametrize("correlated", [0.0, 0.02])
+def test_noise_that_changes_slowly_is_seen_whole(correlated: float):
+    rng = np.random.default_rng(0)
+    sizes = np.asarray([5e-4, 8e-3])
+    keep = np.exp(-(UNIFORM[1] - UNIFORM[0]) / correlated) if correlated else 0.0
+    noise = rng.normal(size=(len(UNIFORM), 2))
+    noise = signal.lfilter([np.sqrt(1 - keep**2)], [1, -keep], noise, axis=0) * sizes
+    angle, speed = np.sin(4 * UNIFORM) + noise[:, 0], 4 * np.cos(4 * UNIFORM) + noise[:, 1]
+    noisy = dataclasses.replace(record(UNIFORM), qpos=angle[:, None], qvel=speed[:, None])
+    assert signal_noise(noisy) == pytest.approx(sizes, rel=0.3)
 
 
 def test_hold_out_is_by_recording_and_of_a_single_one_its_last_third():
