@@ -166,21 +166,26 @@ def evaluate(
     key: jax.Array,
     num_episodes: int,
 ) -> jax.Array:
-    """Return the undiscounted returns [num_episodes] of whole episodes."""
+    """Return undiscounted returns [num_episodes] of whole episodes; stop when all have ended."""
     shares = split.num_shares(num_episodes)
+    reset_key, key = jax.random.split(key)
+    keys = jax.random.split(key, env.episode_length)
 
-    def step(carry, key):
-        state, alive, total = carry
+    def unfinished(carry) -> jax.Array:
+        length, _, alive, _ = carry
+        return (length < env.episode_length) & alive.any()
+
+    def step(carry):
+        length, state, alive, total = carry
+        key = keys[length]
         state, transition, _ = _step(env, params, policy, policy_params, state, key, shares)
         total = total + alive * transition.reward
         alive = alive & ~(transition.terminated | transition.truncated)
-        return (state, alive, total), None
+        return length + 1, state, alive, total
 
-    reset_key, key = jax.random.split(key)
     state = split.own_share(reset(env, params, reset_key, num_episodes), shares)
-    carry = (state, jnp.ones_like(state.steps, bool), jnp.zeros(state.steps.shape))
-    keys = jax.random.split(key, env.episode_length)
-    return split.join(jax.lax.scan(step, carry, keys)[0][2], shares)
+    start = (0, state, jnp.ones_like(state.steps, bool), jnp.zeros(state.steps.shape))
+    return split.join(jax.lax.while_loop(unfinished, step, start)[3], shares)
 
 
 def replay(env: Env, params: Params, recorded: Recorded, key: jax.Array) -> jax.Array:

@@ -297,10 +297,10 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
         source_state,
         axes,
     )
-    more_state = experiment.retrain("more source training", source.env, source.params, source_state)
-    noisy = GroundedEnv(source.env, _action_noise(source.env, config.action_noise))
-    noise_state = experiment.retrain(
-        "action noise", noisy, Grounding(source.params, ()), source_state
+    noisy = GroundedEnv(source.env, _action_noise(source.env))
+    more_state, noise_state = (
+        experiment.retrain(stage, noisy, Grounding(source.params, jnp.asarray(scale)), source_state)
+        for stage, scale in (("more source training", 0.0), ("action noise", config.action_noise))
     )
     states = {
         "source_policy": source_state,
@@ -340,11 +340,12 @@ def _fold(keys: jax.Array, name: str) -> jax.Array:
     return jax.vmap(lambda key: jax.random.fold_in(key, number))(keys)
 
 
-def _action_noise(env: Env, scale: float):
+def _action_noise(env: Env):
+    """Return what adds noise to actions; its parameter is the noise's scale in half-ranges, []."""
     half_range = (env.action_high - env.action_low) / 2
 
-    def transform(params: Params, obs: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
-        del params, obs
+    def transform(scale: jax.Array, obs: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
+        del obs
         return action + scale * half_range * jax.random.normal(key, action.shape)
 
     return transform
