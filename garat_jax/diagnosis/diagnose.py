@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.drift import find_drifts
+from garat_jax.diagnosis.fit import settle
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, signals
-from garat_jax.diagnosis.metric import make_metric
+from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Predictor, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
@@ -70,7 +71,10 @@ def diagnose(
     )
     sample = grid.interval * grid.per_sample
     problem = Problem(simulator, finer, segments, segments.recording < len(fitted), sample)
-    outcome = explain(problem, segments.start, say)
+    say("the model as it is")
+    settled = settle(problem, simulator.base, segments.start)
+    problem = trusted(problem, settled)
+    outcome = explain(problem, settled.start, say)
     error = _errors(problem, outcome, host, f"{how}, segments of {horizon:g} s")
     return Diagnosis(
         model=str(model.path),
@@ -186,12 +190,13 @@ def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str) 
     shape = (-1, *segments.measured.shape[1:])
     listed = signals(host)
     per_signal = {}
+    sampled = segments.weight[held_out] > 0
     for i in range(shape[-1]):
         sizes = [
-            float(np.sqrt(np.mean(residual[segments.weight[held_out] > 0][:, i] ** 2)))
+            float(np.sqrt(np.mean(residual.reshape(shape)[sampled][:, i] ** 2)))
             for residual in (
-                outcome.before.residual[held_out].reshape(shape),
-                outcome.after.residual[held_out].reshape(shape),
+                outcome.before.residual[held_out] / metric.trust[held_out],
+                outcome.after.residual[held_out] / metric.trust[held_out],
             )
         ]
         noise = float(segments.noise[i])

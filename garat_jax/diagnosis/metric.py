@@ -1,14 +1,19 @@
 """The error that a diagnosis reports, and the floor that noise and the integrator set it."""
 
-from typing import NamedTuple
+import dataclasses
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from garat_jax.diagnosis.fit import Fit
 from garat_jax.diagnosis.problem import Problem, StartSpace
 
+AnyProblem = TypeVar("AnyProblem", bound=Problem)
+
 ABOVE_FLOOR = 1.5
 """A model is adequate up to this multiple of the noise floor."""
+TRUSTED = 3.0
+"""Standard deviations of noise that the timestep's error may reach before a sample counts less."""
 
 
 class Metric(NamedTuple):
@@ -17,17 +22,19 @@ class Metric(NamedTuple):
     Attributes:
         weight: Squared metric of one squared whitened residual, [N].
         counted: Which residuals are samples and not padding, [S, N].
+        trust: How much each counts in a fit and in decisions, [S, N].
         spread: Standard deviation of each signal in the held-out data, its noise at least,
             [num_signals].
     """
 
     weight: np.ndarray
     counted: np.ndarray
+    trust: np.ndarray
     spread: np.ndarray
 
     def error(self, residual: np.ndarray, chosen: np.ndarray) -> float:
-        """Return the root mean square over samples and signals of the chosen segments."""
-        squares = residual[chosen] ** 2 * self.weight
+        """Return the root mean square over samples, all alike, and signals of chosen segments."""
+        squares = (residual[chosen] / self.trust[chosen]) ** 2 * self.weight
         return float(np.sqrt(squares.sum() / self.count(chosen)))
 
     def count(self, chosen: np.ndarray) -> int:
@@ -35,10 +42,12 @@ class Metric(NamedTuple):
         return max(int(self.counted[chosen].sum()), 1)
 
     def by_signal(self, residual: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """Return the error of each signal in units of its noise, [num_signals]."""
+        """Return the error of each signal in units of its noise, as trusted, [num_signals]."""
         num_signals = len(self.spread)
+        counted = self.counted[chosen] * self.trust[chosen]
         squares = (residual[chosen] ** 2 * self.counted[chosen]).reshape(-1, num_signals)
-        return np.sqrt(squares.sum(axis=0) / self.counted[chosen].sum() * num_signals)
+        total = np.maximum((counted**2).reshape(-1, num_signals).sum(axis=0), 1e-300)
+        return np.sqrt(squares.sum(axis=0) / total)
 
 
 def make_metric(problem: Problem) -> Metric:
@@ -47,7 +56,31 @@ def make_metric(problem: Problem) -> Metric:
     held_out = (s.weight > 0) & ~problem.fitted[:, None]
     spread = np.maximum(s.measured[held_out].std(axis=0), s.noise)
     weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
-    return Metric(weight, np.repeat(s.weight > 0, s.measured.shape[2], axis=1), spread)
+    num_signals = s.measured.shape[2]
+    counted, trust = (np.repeat(x, num_signals, axis=1) for x in (s.weight > 0, s.trust))
+    return Metric(weight, counted, trust, spread)
+
+
+def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
+    """Let samples count less that the model's timestep does not let it predict.
+
+    Where half a timestep changes a prediction by many standard deviations of noise, as after an
+    impact, a residual says nothing of the model's physics. Such changes last to the end of a
+    segment. What other initial states would undo does not count.
+
+    Args:
+        problem: What is fitted.
+        settled: The model as it is, initial states fitted.
+    """
+    segments = problem.segments
+    change = problem.integrator_error(settled.theta, settled.start, settled.residual)
+    rest = StartSpace(settled.sensitivity).remove(change[..., None])[..., 0]
+    squares = np.minimum(
+        *(np.mean((2.0 * x).reshape(segments.measured.shape) ** 2, axis=2) for x in (change, rest))
+    )
+    size = np.sqrt(np.maximum.accumulate(squares, axis=1))
+    trust = 1.0 / np.maximum(1.0, size / TRUSTED)
+    return dataclasses.replace(problem, segments=dataclasses.replace(segments, trust=trust))
 
 
 class Floor(NamedTuple):
@@ -67,7 +100,7 @@ def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
     held_out = ~problem.fitted
     change = problem.integrator_error(current.theta, current.start, current.residual)
     change = 2.0 * StartSpace(current.sensitivity).remove(change[..., None])[..., 0]
-    noise = metric.counted.astype(float)
+    noise = metric.counted * metric.trust
     return Floor(
         float(np.hypot(metric.error(noise, held_out), metric.error(change, held_out))),
         np.hypot(1.0, metric.by_signal(change, held_out)),

@@ -1,6 +1,7 @@
 """What is fitted to what, and how the residuals change with parameters and initial states.
 
-Residuals are prediction minus measurement, in units of each signal's noise. Sensitivities to the
+Residuals are prediction minus measurement, in units of each signal's noise, and count as far as a
+sample is trusted. Sensitivities to the
 parameters and to the initial states come from the same batched simulation.
 """
 
@@ -80,16 +81,20 @@ class Problem(Generic[AnySimulator]):
     def whiten(self, predicted: np.ndarray) -> np.ndarray:
         """Return whitened residuals [..., S, N] of predictions [..., S, L, num_signals]."""
         s = self.segments
-        residual = (predicted - s.measured) * (s.weight[..., None] / s.noise)
+        residual = (predicted - s.measured) * self._scale()
         residual = np.where(np.isfinite(residual), residual, LARGE)
         return np.clip(residual, -LARGE, LARGE).reshape(*residual.shape[:-2], -1)
 
     def whiten_change(self, change: np.ndarray) -> np.ndarray:
         """Return changes of predictions [..., S, L, num_signals], whitened, [..., S, N]."""
-        s = self.segments
-        change = change * (s.weight[..., None] / s.noise)
+        change = change * self._scale()
         change = np.where(np.isfinite(change), change, 0.0)
         return np.clip(change, -LARGE, LARGE).reshape(*change.shape[:-2], -1)
+
+    def _scale(self) -> np.ndarray:
+        """Return what a deviation counts, [S, L, num_signals]."""
+        s = self.segments
+        return (s.weight * s.trust)[..., None] / s.noise
 
     def integrator_error(
         self, theta: np.ndarray, start: np.ndarray, residual: np.ndarray

@@ -74,7 +74,6 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         start: Initial states to start from, [S, nq + nv].
         say: Told what is being done.
     """
-    say("the model as it is")
     before = settle(problem, problem.simulator.base, start)
     metric = make_metric(problem)
     floor = noise_floor(problem, metric, before)

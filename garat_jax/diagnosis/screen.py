@@ -1,7 +1,8 @@
 """Score every candidate effect at the current fit, before any of them is fitted.
 
 A candidate's sensitivity is the change of the predictions at a realistic size of its parameters; a
-law with a threshold, which does nothing below it, is tried at several (`Effect.starts`). What
+law with a threshold, which does nothing below it, is tried at several (`Effect.starts`; see
+`trials`). What
 initial states and parameters already free can explain is projected out. Evidence is a Wald test of
 what is left after common delay, sensor offsets and the integrator's error too, with blocks of time
 as the independent units (Liang and Zeger 1986) and Holm's correction (1979).
@@ -24,8 +25,8 @@ from garat_jax.diagnosis.problem import (
     tall,
 )
 from garat_jax.diagnosis.robust import orthonormal, wald_test, without
-from garat_jax.diagnosis.simulate import Simulator, columns_of
-from garat_jax.effects import Effect
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.trials import Row, Trial, best_sizes, enlarge, firsts, others
 
 EQUIVALENT = 0.95
 """Cosine of two candidates' contributions above which the recordings cannot tell them apart."""
@@ -71,38 +72,6 @@ class Score:
     possible: bool
     contribution: np.ndarray
     excluded: str = ""
-
-
-class _Row(NamedTuple):
-    """One perturbed simulation.
-
-    Attributes:
-        column: The parameter that is moved last.
-        values: All that is set, by column.
-        step: By how much `column` is moved.
-        below: The row whose change is subtracted; -1 for none.
-    """
-
-    column: int
-    values: dict[int, float]
-    step: float
-    below: int
-
-
-class _Trial(NamedTuple):
-    """One candidate tried at one size.
-
-    Attributes:
-        effect: Index among the simulator's effects.
-        start: What "tried" sets, by column.
-        rows: Indices of the rows that move one parameter each, the first parameter's first.
-        is_only: Whether the law is tried at one size; then sizes are extrapolated from it.
-    """
-
-    effect: int
-    start: dict[int, float]
-    rows: tuple[int, ...]
-    is_only: bool
 
 
 class _Sensitivities(NamedTuple):
@@ -173,76 +142,6 @@ def cosine(a: Score, b: Score) -> float:
     return float(abs(a.contribution @ b.contribution) / size) if size > 0 else 0.0
 
 
-def _firsts(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[_Row], list[_Trial]]:
-    """List each candidate at each of its sizes, a row for each."""
-    rows: list[_Row] = []
-    trials = []
-    for index, effect in enumerate(simulator.effects):
-        names = columns_of(simulator.slots, index)
-        columns = list(names.values())
-        if index in skip or not columns:
-            continue
-        starts = _sizes(simulator, theta, effect, columns)
-        for given in starts:
-            start = {names[name]: value for name, value in given.items()}
-            if len(starts) == 1 and len(start) == 1:
-                step = _step_within(simulator, columns[0], theta[columns[0]])
-                start = {columns[0]: theta[columns[0]] + step}
-            moved = next(j for j in columns if j in start)
-            trials.append(_Trial(index, start, (len(rows),), len(starts) == 1))
-            rows.append(_Row(moved, start, start[moved] - theta[moved], -1))
-    return rows, trials
-
-
-def _sizes(simulator: Simulator, theta: np.ndarray, effect: Effect, columns: list[int]):
-    """Return the sizes at which to try an effect; half and twice its size where it acts already."""
-    starts = effect.starts(simulator.host, effect.target)
-    none = effect.at(simulator.host, effect.target)
-    slots = [simulator.slots[j].parameter for j in columns]
-    acts = any(theta[j] != none[p.name] for j, p in zip(columns, slots, strict=True))
-    if len(starts) == 1 or not acts:
-        return starts
-    first, size = slots[0], float(theta[columns[0]])
-    return tuple({first.name: min(factor * size, first.high)} for factor in (0.5, 2.0))
-
-
-def _best_sizes(trials: list[_Trial], changes: np.ndarray, residual: np.ndarray) -> list[_Trial]:
-    """Return each candidate's trial that explains most by itself, in the direction tried."""
-    best: dict[int, tuple[tuple[bool, float], _Trial]] = {}
-    for trial in trials:
-        change = changes[:, trial.rows[0]]
-        along = -float(change @ residual) / (float(np.linalg.norm(change)) or np.inf)
-        merit = (trial.is_only or along > 0, abs(along))
-        if trial.effect not in best or merit > best[trial.effect][0]:
-            best[trial.effect] = (merit, trial)
-    return [trial for _, trial in best.values()]
-
-
-def _others(simulator: Simulator, theta: np.ndarray, rows: list[_Row], trials: list[_Trial]):
-    """Add a row for each further parameter of the trials; return all rows and the trials."""
-    rows, extended = list(rows), []
-    for trial in trials:
-        first, effect = trial.rows[0], simulator.effects[trial.effect]
-        columns = list(columns_of(simulator.slots, trial.effect).values())
-        chosen = [first]
-        for j in columns:
-            if j == rows[first].column:
-                continue
-            base = trial.start[j] if j in trial.start else float(theta[j])
-            step = _step_within(simulator, j, base)
-            alone = effect.independent and len(trial.start) == 1
-            chosen.append(len(rows))
-            values = {j: base + step} if alone else {**trial.start, j: base + step}
-            rows.append(_Row(j, values, step, -1 if alone else first))
-        extended.append(trial._replace(rows=tuple(chosen)))
-    return rows, extended
-
-
-def _step_within(simulator: Simulator, column: int, value: float) -> float:
-    p = simulator.slots[column].parameter
-    return p.scale if value + p.scale <= p.high else -p.scale
-
-
 def _measure(problem: Problem[Simulator], fit: Fit, start, skip):
     """Simulate the candidates at all their sizes, then the other parameters of the best size.
 
@@ -254,7 +153,7 @@ def _measure(problem: Problem[Simulator], fit: Fit, start, skip):
     lin = linearise(problem, fit.theta, start, fit.free, steps)
     remove = _Remover(lin)
 
-    def change(rows: list[_Row]) -> np.ndarray:
+    def change(rows: list[Row]) -> np.ndarray:
         thetas = np.tile(fit.theta, (len(rows), 1))
         for theta, row in zip(thetas, rows, strict=True):
             theta[list(row.values)] = list(row.values.values())
@@ -262,10 +161,14 @@ def _measure(problem: Problem[Simulator], fit: Fit, start, skip):
         return remove(problem.whiten_change(moved))
 
     residual = remove(lin.residual[None])[:, 0]
-    firsts, trials = _firsts(simulator, fit.theta, skip)
-    changes = change(firsts)
-    rows, trials = _others(simulator, fit.theta, firsts, _best_sizes(trials, changes, residual))
-    if more := rows[len(firsts) :]:
+    rows, trials = firsts(simulator, fit.theta, skip)
+    changes = change(rows)
+    rows, larger = enlarge(simulator, rows, trials, changes, residual)
+    if larger:
+        changes[:, larger] = change([rows[i] for i in larger])
+    num_firsts = len(rows)
+    rows, trials = others(simulator, fit.theta, rows, best_sizes(trials, changes, residual))
+    if more := rows[num_firsts:]:
         below = [changes[:, row.below] if row.below >= 0 else 0.0 * residual for row in more]
         changes = np.concatenate([changes, change(more) - np.stack(below, axis=1)], axis=1)
     integrator = problem.integrator_error(fit.theta, start, lin.residual)
@@ -288,7 +191,7 @@ def _offsets(problem: Problem) -> np.ndarray:
     segments = problem.segments
     num_position = problem.simulator.host.nq
     unit = np.eye(segments.measured.shape[2])[:num_position] / segments.noise
-    offset = segments.weight[None, :, :, None] * unit[:, None, None, :]
+    offset = (segments.weight * segments.trust)[None, :, :, None] * unit[:, None, None, :]
     return offset.reshape(num_position, *segments.weight.shape[:1], -1)
 
 
@@ -304,7 +207,7 @@ class _Remover:
         return without(tall(rest), self._free)
 
 
-def _score(problem: Problem, s: _Sensitivities, rows: list[_Row], trial: _Trial) -> Score:
+def _score(problem: Problem, s: _Sensitivities, rows: list[Row], trial: Trial) -> Score:
     """Judge one candidate at one size."""
     chosen = list(trial.rows)
     slots = [problem.simulator.slots[rows[i].column].parameter for i in chosen]
@@ -336,7 +239,7 @@ def _score(problem: Problem, s: _Sensitivities, rows: list[_Row], trial: _Trial)
     return Score(trial.effect, columns, size, start, share, p_value, possible, contribution)
 
 
-def _size(simulator: Simulator, rows: list[_Row], trial: _Trial, chosen: list[int], factor):
+def _size(simulator: Simulator, rows: list[Row], trial: Trial, chosen: list[int], factor):
     """Return the expected values of the chosen rows, where a fit starts, and if it is possible.
 
     Where the first parameter switches an effect on, it multiplies the others. A law with a

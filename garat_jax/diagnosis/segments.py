@@ -35,6 +35,7 @@ class Segments:
     Attributes:
         measured: Measured signals, [S, L, num_signals].
         weight: 1 for a sample, 0 for padding, [S, L].
+        trust: How much the residual of a sample counts, 0 to 1, [S, L]; see `metric.trusted`.
         start: Measured initial state (qpos, qvel), [S, nq + nv].
         ctrl: Command of every simulated step, the warm-up's first, [S, warm_up + steps, nu].
         place: Where a sample lies between simulated steps, [S, L].
@@ -46,6 +47,7 @@ class Segments:
 
     measured: np.ndarray
     weight: np.ndarray
+    trust: np.ndarray
     start: np.ndarray
     ctrl: np.ndarray
     place: np.ndarray
@@ -56,7 +58,7 @@ class Segments:
 
     def take(self, chosen: np.ndarray) -> "Segments":
         """Return some of the segments; noise and spread stay those of all."""
-        by_segment = ("measured", "weight", "start", "ctrl", "place", "recording", "first")
+        by_segment = ("measured", "weight", "trust", "start", "ctrl", "place", "recording", "first")
         parts = {name: getattr(self, name)[chosen] for name in by_segment}
         return dataclasses.replace(self, **parts)
 
@@ -137,6 +139,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     return Segments(
         measured=measured,
         weight=weight,
+        trust=np.ones_like(weight),
         start=start,
         ctrl=ctrl,
         place=place,

@@ -95,7 +95,9 @@ def test_each_condition_is_simulated_with_what_is_shared_and_what_is_its_own():
     segments = Segments(
         measured=np.zeros((4, 1, 2)),
         recording=np.arange(4),
-        **dict.fromkeys(("weight", "start", "ctrl", "place", "first", "noise", "spread"), many),
+        **dict.fromkeys(
+            ("weight", "trust", "start", "ctrl", "place", "first", "noise", "spread"), many
+        ),
     )
     theta = np.stack([joint.base, 10 * joint.base])
     predicted = joint.predict(theta, np.zeros((2, 4, 2)), segments)

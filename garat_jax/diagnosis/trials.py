@@ -1,0 +1,157 @@
+"""What screening simulates: each candidate at one size or several, and each of its parameters."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from garat_jax.diagnosis.simulate import Simulator, columns_of
+from garat_jax.effects import Effect
+
+ERRATIC = 10.0
+"""Root mean square of a change, relative to its median size, above which few samples make it."""
+ROOM = 0.3
+"""Share of the way to a bound that a step is enlarged to at most."""
+
+
+class Row(NamedTuple):
+    """One perturbed simulation.
+
+    Attributes:
+        column: The parameter that is moved last.
+        values: All that is set, by column.
+        step: By how much `column` is moved.
+        below: The row whose change is subtracted; -1 for none.
+    """
+
+    column: int
+    values: dict[int, float]
+    step: float
+    below: int
+
+
+class Trial(NamedTuple):
+    """One candidate tried at one size.
+
+    Attributes:
+        effect: Index among the simulator's effects.
+        start: What "tried" sets, by column.
+        rows: Indices of the rows that move one parameter each, the first parameter's first.
+        is_only: Whether the law is tried at one size; then sizes are extrapolated from it.
+    """
+
+    effect: int
+    start: dict[int, float]
+    rows: tuple[int, ...]
+    is_only: bool
+
+
+def firsts(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[Row], list[Trial]]:
+    """List each candidate at each of its sizes, a row for each."""
+    rows: list[Row] = []
+    trials = []
+    for index, effect in enumerate(simulator.effects):
+        names = columns_of(simulator.slots, index)
+        columns = list(names.values())
+        if index in skip or not columns:
+            continue
+        starts = _sizes(simulator, theta, effect, columns)
+        for given in starts:
+            start = {names[name]: value for name, value in given.items()}
+            if len(starts) == 1 and len(start) == 1:
+                step = _step_within(simulator, columns[0], theta[columns[0]])
+                start = {columns[0]: theta[columns[0]] + step}
+            moved = next(j for j in columns if j in start)
+            trials.append(Trial(index, start, (len(rows),), len(starts) == 1))
+            rows.append(Row(moved, start, start[moved] - theta[moved], -1))
+    return rows, trials
+
+
+def _sizes(simulator: Simulator, theta: np.ndarray, effect: Effect, columns: list[int]):
+    """Return the sizes at which to try an effect; half and twice its size where it acts already."""
+    starts = effect.starts(simulator.host, effect.target)
+    none = effect.at(simulator.host, effect.target)
+    slots = [simulator.slots[j].parameter for j in columns]
+    acts = any(theta[j] != none[p.name] for j, p in zip(columns, slots, strict=True))
+    if len(starts) == 1 or not acts:
+        return starts
+    first, size = slots[0], float(theta[columns[0]])
+    return tuple({first.name: min(factor * size, first.high)} for factor in (0.5, 2.0))
+
+
+def best_sizes(trials: list[Trial], changes: np.ndarray, residual: np.ndarray) -> list[Trial]:
+    """Return each candidate's trial that explains most by itself, in the direction tried."""
+    best: dict[int, tuple[tuple[bool, float], Trial]] = {}
+    for trial in trials:
+        change = changes[:, trial.rows[0]]
+        along = -float(change @ residual) / (float(np.linalg.norm(change)) or np.inf)
+        merit = (trial.is_only or along > 0, abs(along))
+        if trial.effect not in best or merit > best[trial.effect][0]:
+            best[trial.effect] = (merit, trial)
+    return [trial for _, trial in best.values()]
+
+
+def others(simulator: Simulator, theta: np.ndarray, rows: list[Row], trials: list[Trial]):
+    """Add a row for each further parameter of the trials; return all rows and the trials."""
+    rows, extended = list(rows), []
+    for trial in trials:
+        first, effect = trial.rows[0], simulator.effects[trial.effect]
+        columns = list(columns_of(simulator.slots, trial.effect).values())
+        chosen = [first]
+        for j in columns:
+            if j == rows[first].column:
+                continue
+            base = trial.start[j] if j in trial.start else float(theta[j])
+            step = _step_within(simulator, j, base)
+            alone = effect.independent and len(trial.start) == 1
+            chosen.append(len(rows))
+            values = {j: base + step} if alone else {**trial.start, j: base + step}
+            rows.append(Row(j, values, step, -1 if alone else first))
+        extended.append(trial._replace(rows=tuple(chosen)))
+    return rows, extended
+
+
+def _step_within(simulator: Simulator, column: int, value: float) -> float:
+    p = simulator.slots[column].parameter
+    return p.scale if value + p.scale <= p.high else -p.scale
+
+
+def enlarge(
+    simulator: Simulator,
+    rows: list[Row],
+    trials: list[Trial],
+    changes: np.ndarray,
+    residual: np.ndarray,
+) -> tuple[list[Row], list[int]]:
+    """Take larger steps where a small one changes few samples much and most hardly.
+
+    Contacts that open or close a step of the engine earlier change what follows by an amount that
+    does not shrink with the perturbation: divided by a small step it drowns the rest. The new step
+    changes the median sample as much as the residual's is.
+
+    Args:
+        simulator: The model with all candidates.
+        rows: One a trial.
+        trials: The candidates at their sizes.
+        changes: What the rows change, [M, rows].
+        residual: [M].
+
+    Returns:
+        The rows, and the indices of those that are new.
+    """
+    wanted = float(np.median(np.abs(residual)))
+    rows, larger = list(rows), []
+    for trial in trials:
+        (index,) = trial.rows
+        row, size = rows[index], np.abs(changes[:, index])
+        median = float(np.median(size))
+        is_erratic = 0 < ERRATIC * median < float(np.sqrt(np.mean(size**2)))
+        if not trial.is_only or len(row.values) > 1 or not is_erratic:
+            continue
+        p = simulator.slots[row.column].parameter
+        base = row.values[row.column] - row.step
+        room = abs((p.high if row.step > 0 else p.low) - base)
+        step = np.sign(row.step) * min(wanted / median * abs(row.step), ROOM * room)
+        if abs(step) > abs(row.step):
+            rows[index] = Row(row.column, {row.column: base + step}, step, -1)
+            larger.append(index)
+    return rows, larger

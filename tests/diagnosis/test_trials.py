@@ -1,0 +1,67 @@
+"""What contacts do to predictions: small steps that tell nothing, samples that count for little."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.fit import settle
+from garat_jax.diagnosis.metric import make_metric, trusted
+from garat_jax.diagnosis.trials import enlarge, firsts
+from tests.diagnosis.test_fit import UNIFORM, candidates, column, make_problem, record
+
+
+class Jumping:
+    """A simulator that half a timestep changes from some sample on."""
+
+    def __init__(self, simulator, first: int, jump: float):
+        self._simulator, self._first, self._jump = simulator, first, jump
+
+    def predict(self, theta, start, segments):
+        predicted = self._simulator.predict(theta, start, segments)
+        predicted[:, :, self._first :] += self._jump
+        return predicted
+
+
+def test_steps_grow_where_few_samples_make_the_change():
+    simulator = make_problem([record(UNIFORM)], candidates()).simulator
+    rows, trials = firsts(simulator, simulator.base, ())
+    damping, friction = (
+        next(
+            t.rows[0]
+            for t in trials
+            if rows[t.rows[0]].column == column(simulator, kind) and t.is_only
+        )
+        for kind in ("viscous_damping", "coulomb_friction")
+    )
+    changes = np.full((1000, len(rows)), 1e-3)
+    changes[::100, friction] = 10.0
+    larger, new = enlarge(simulator, rows, trials, changes, np.full(1000, 0.5))
+    assert new == [friction]
+    assert larger[friction].step == pytest.approx(500 * rows[friction].step)
+    column_, base = rows[friction].column, simulator.base
+    assert larger[friction].values[column_] == pytest.approx(base[column_] + larger[friction].step)
+    assert larger[damping] == rows[damping]
+    p = simulator.slots[column_].parameter
+    far, _ = enlarge(simulator, rows, trials, changes, np.full(1000, 1e9))
+    assert far[friction].step == pytest.approx(0.3 * (p.high - p.low))
+
+
+def test_samples_that_half_a_timestep_changes_count_less_and_are_reported_as_they_are():
+    problem = make_problem([record(UNIFORM, damping=0.02)], ())
+    problem = dataclasses.replace(problem, fitted=np.arange(len(problem.fitted)) % 2 == 0)
+    settled = settle(problem, problem.simulator.base, problem.segments.start)
+    same = trusted(problem, settled).segments.trust
+    assert same.min() > 0.5
+    finer = Jumping(problem.simulator, 60, 1000.0)
+    doubted = trusted(dataclasses.replace(problem, finer=finer), settled)
+    trust = doubted.segments.trust
+    assert trust[:, 60:].max() < 0.01
+    np.testing.assert_array_equal(trust[:, :60], 1.0)
+    again = doubted.whiten(
+        doubted.simulator.predict(settled.theta[None], settled.start[None], doubted.segments)
+    )[0]
+    raw, weighed = make_metric(problem), make_metric(doubted)
+    held_out = ~problem.fitted
+    assert weighed.error(again, held_out) == pytest.approx(raw.error(settled.residual, held_out))
+    assert np.abs(again).sum() < 0.7 * np.abs(settled.residual).sum()
