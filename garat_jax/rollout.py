@@ -166,26 +166,21 @@ def evaluate(
     key: jax.Array,
     num_episodes: int,
 ) -> jax.Array:
-    """Return undiscounted returns [num_episodes] of whole episodes; stop when all have ended."""
+    """Return the undiscounted returns [num_episodes] of whole episodes."""
     shares = split.num_shares(num_episodes)
-    reset_key, key = jax.random.split(key)
-    keys = jax.random.split(key, env.episode_length)
 
-    def unfinished(carry) -> jax.Array:
-        length, _, alive, _ = carry
-        return (length < env.episode_length) & alive.any()
-
-    def step(carry):
-        length, state, alive, total = carry
-        key = keys[length]
+    def step(carry, key):
+        state, alive, total = carry
         state, transition, _ = _step(env, params, policy, policy_params, state, key, shares)
         total = total + alive * transition.reward
         alive = alive & ~(transition.terminated | transition.truncated)
-        return length + 1, state, alive, total
+        return (state, alive, total), None
 
+    reset_key, key = jax.random.split(key)
     state = split.own_share(reset(env, params, reset_key, num_episodes), shares)
-    start = (0, state, jnp.ones_like(state.steps, bool), jnp.zeros(state.steps.shape))
-    return split.join(jax.lax.while_loop(unfinished, step, start)[3], shares)
+    carry = (state, jnp.ones_like(state.steps, bool), jnp.zeros(state.steps.shape))
+    keys = jax.random.split(key, env.episode_length)
+    return split.join(jax.lax.scan(step, carry, keys)[0][2], shares)
 
 
 def replay(env: Env, params: Params, recorded: Recorded, key: jax.Array) -> jax.Array:
