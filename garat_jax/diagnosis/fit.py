@@ -23,10 +23,6 @@ from garat_jax.diagnosis.robust import regress
 
 STEP = 1e-2
 """Finite difference of a fit, relative to a parameter's `scale` or size."""
-WIDEST = 1.0
-"""The same where a fit is stuck: contacts make small differences meaningless."""
-STUCK = 100.0
-"""Damping above which a fit is stuck; it then tries wider differences, and moves starts less."""
 UNEXCITED = 1e-6
 """Sensitivity, relative to the residual's size at the bounds, below which a direction is frozen."""
 FITTED = 1e-4
@@ -162,10 +158,10 @@ def fit(
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
     """
     theta, free = np.array(theta, float), tuple(free)
-    damping, start_damping, reach = 1e-4, np.zeros(len(start)), STEP
+    damping, undamped = 1e-4, np.zeros(len(start))
 
     def at(theta, start, sensitivity) -> Linearisation:
-        steps = difference_steps(problem, theta, free, reach)
+        steps = difference_steps(problem, theta, free, STEP)
         return linearise(problem, theta, start, free, steps, sensitivity)
 
     lin = at(theta, start, sensitivity)
@@ -173,7 +169,7 @@ def fit(
     for taken in range(iterations):
         change, keep = _parameter_step(problem, theta, lin, free, damping)
         expected = lin.residual + lin.parameters @ change
-        start_change = _start_step(lin, expected, start_damping)
+        start_change = _start_step(lin, expected, undamped)
         before = np.sum(lin.residual[problem.fitted] ** 2)
         promised = _promised(lin, expected, start_change)[problem.fitted].sum()
         if before - promised < FITTED * before or damping > 1e8:
@@ -192,10 +188,6 @@ def fit(
             theta, lin, damping = trial_theta, _choose(moved, trial, lin), damping * 0.1
         elif not is_stale:
             damping = max(damping, 1e-3) * 30.0
-            if damping > STUCK and reach < WIDEST:
-                worse = np.sum(trial.residual**2, 1) > np.sum(lin.residual**2, 1)
-                damping, reach, start_damping = 1e-4, WIDEST, np.where(worse, 1e-2, 0.0)
-                lin = at(theta, start, lin.start)
         if is_stale and fall < KEPT_PROMISE * (before - promised):
             lin, is_stale = at(theta, start, None), False
         elif fall > 0:
