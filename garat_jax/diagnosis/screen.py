@@ -163,7 +163,7 @@ def _measure(problem: Problem[Simulator], fit: Fit, start, skip):
     residual = remove(lin.residual[None])[:, 0]
     rows, trials = firsts(simulator, fit.theta, skip)
     changes = change(rows)
-    rows, larger = enlarge(simulator, rows, trials, changes, residual)
+    rows, trials, larger = enlarge(simulator, rows, trials, changes, residual)
     if larger:
         changes[:, larger] = change([rows[i] for i in larger])
     num_firsts = len(rows)

@@ -121,7 +121,7 @@ def enlarge(
     trials: list[Trial],
     changes: np.ndarray,
     residual: np.ndarray,
-) -> tuple[list[Row], list[int]]:
+) -> tuple[list[Row], list[Trial], list[int]]:
     """Take larger steps where a small one changes few samples much and most hardly.
 
     Contacts that open or close a step of the engine earlier change what follows by an amount that
@@ -136,11 +136,11 @@ def enlarge(
         residual: [M].
 
     Returns:
-        The rows, and the indices of those that are new.
+        The rows, the trials, which start from them, and the indices of the rows that are new.
     """
     wanted = float(np.median(np.abs(residual)))
-    rows, larger = list(rows), []
-    for trial in trials:
+    rows, trials, larger = list(rows), list(trials), []
+    for number, trial in enumerate(trials):
         (index,) = trial.rows
         row, size = rows[index], np.abs(changes[:, index])
         median = float(np.median(size))
@@ -152,6 +152,10 @@ def enlarge(
         room = abs((p.high if row.step > 0 else p.low) - base)
         step = np.sign(row.step) * min(wanted / median * abs(row.step), ROOM * room)
         if abs(step) > abs(row.step):
-            rows[index] = Row(row.column, {row.column: base + step}, step, -1)
+            start = {row.column: base + step}
+            rows[index], trials[number] = (
+                Row(row.column, start, step, -1),
+                trial._replace(start=start),
+            )
             larger.append(index)
-    return rows, larger
+    return rows, trials, larger

@@ -36,14 +36,16 @@ def test_steps_grow_where_few_samples_make_the_change():
     )
     changes = np.full((1000, len(rows)), 1e-3)
     changes[::100, friction] = 10.0
-    larger, new = enlarge(simulator, rows, trials, changes, np.full(1000, 0.5))
+    larger, started, new = enlarge(simulator, rows, trials, changes, np.full(1000, 0.5))
     assert new == [friction]
     assert larger[friction].step == pytest.approx(500 * rows[friction].step)
     column_, base = rows[friction].column, simulator.base
     assert larger[friction].values[column_] == pytest.approx(base[column_] + larger[friction].step)
+    (trial,) = (t for t in started if t.rows == (friction,))
+    assert trial.start == larger[friction].values
     assert larger[damping] == rows[damping]
     p = simulator.slots[column_].parameter
-    far, _ = enlarge(simulator, rows, trials, changes, np.full(1000, 1e9))
+    far, _, _ = enlarge(simulator, rows, trials, changes, np.full(1000, 1e9))
     assert far[friction].step == pytest.approx(0.3 * (p.high - p.low))
 
 
