@@ -5,7 +5,6 @@
 """
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -66,7 +65,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/real_data"))
     parser.add_argument("--only", choices=CASES, nargs="+", default=list(CASES))
     arguments = parser.parse_args()
-    command = shlex.join(["python", "benchmarks/real_data.py", "FOLDER", *sys.argv[2:]])
+    command = "python benchmarks/real_data.py FOLDER"
     rows = [run_case(name, arguments.folder, arguments.out, command) for name in arguments.only]
     if set(arguments.only) == set(CASES):
         write_result("real_data", rows, seeds=[], command=command)

@@ -96,6 +96,24 @@ def fit_refinements(
     return contenders
 
 
+def fit_further(problem: Problem, best: Contender, say: Callable[[str], None]) -> list[Contender]:
+    """Fit the best contender with its further parameters, if screening left some out.
+
+    Beside a large effect, a parameter that matters later explains a small part only.
+    """
+    columns = columns_of(problem.simulator.slots, best.score.effect).values()
+    further = [j for j in columns if j not in best.score.columns]
+    if not further:
+        return []
+    effect = problem.simulator.effects[best.score.effect]
+    say(f"fitting every parameter of {effect.kind} at {effect.target}")
+    free = (*best.fit.free, *further)
+    start, sensitivity = best.fit.start, best.fit.sensitivity
+    fitted = fit(problem, best.fit.theta, start, free, sensitivity=sensitivity)
+    score = dataclasses.replace(best.score, columns=(*best.score.columns, *further))
+    return [Contender(score, fitted)]
+
+
 def _fit(problem: Problem, current: Fit, score: Score, rival: float, say) -> Contender:
     """Fit the selected effects and one more, from where screening puts it."""
     effect = problem.simulator.effects[score.effect]

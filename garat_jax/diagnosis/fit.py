@@ -16,23 +16,36 @@ from garat_jax.diagnosis.problem import (
     StartSpace,
     block_labels,
     difference_steps,
+    is_erratic,
     linearise,
     tall,
 )
 from garat_jax.diagnosis.robust import regress
+from garat_jax.diagnosis.segments import nearby_starts
+from garat_jax.diagnosis.starts import (
+    KEPT_PROMISE,
+    SETTLE_STEPS,
+    choose,
+    promised_costs,
+    settle_anew,
+    settle_starts,
+    start_step,
+)
 
 STEP = 1e-2
 """Finite difference of a fit, relative to a parameter's `scale` or size."""
-UNEXCITED = 1e-6
-"""Sensitivity, relative to the residual's size at the bounds, below which a direction is frozen."""
 FITTED = 1e-4
 """Fall of the cost, relative to it, below which a fit has converged."""
-SETTLED = 1e-3
-"""Fall of a segment's cost, relative to it, below which its initial state is left as it is."""
-SETTLE_STEPS = 10
-"""Steps of the initial states after a fit, whose own steps have moved them already."""
-KEPT_PROMISE = 0.5
-"""Fall of the cost, relative to the promised one, below which sensitivities are measured again."""
+DESCENTS = 2
+"""How often a fit is done at most, where initial states that were sought anew lower its cost."""
+SAME = 0.95
+"""Cost with initial states sought anew, relative to that before, above which nothing is new."""
+WIDE = 0.5
+"""Finite difference where contacts are erratic, relative to a parameter's `scale` or size."""
+SEARCHED = 24
+"""Segments with which a search is made at least, evenly chosen; each of its steps settles them."""
+SEARCH_STEPS = 6
+"""Largest number of a search's Gauss-Newton steps."""
 BEATEN = 2.0
 """Cost, relative to another fit's, above which a fit is not worth its last steps."""
 
@@ -75,62 +88,10 @@ def settle(problem: Problem, theta: np.ndarray, start: np.ndarray, iterations: i
     its cost that matters; a step that was rejected is tried again, shorter.
     """
     lin = linearise(problem, theta, start, (), ())
-    start, lin = _settle(problem, theta, start, lin, iterations)
+    start, lin = settle_starts(problem, theta, start, lin, iterations)
+    start, lin = settle_anew(problem, theta, start, lin)
     nothing = np.zeros(0)
     return Fit(theta, (), (), start, lin.residual, lin.start, nothing, nothing)
-
-
-def _settle(problem: Problem, theta, start, lin: Linearisation, iterations: int):
-    """Return settled initial states and the linearisation at them, from one that is near."""
-    lin = lin._replace(parameters=lin.parameters[..., :0])
-    damping, is_stale = np.full(len(start), 1e-6), np.ones(len(start), bool)
-    for _ in range(iterations):
-        change = _start_step(lin, lin.residual, damping)
-        before = np.sum(lin.residual**2, 1)
-        promised = before - _promised(lin, lin.residual, change)
-        open_still = promised >= SETTLED * before
-        if not np.any(open_still):
-            break
-        starts = start + change * lin.start_unit
-        trial = linearise(problem, theta, starts, (), (), lin.start)
-        fall = before - np.sum(trial.residual**2, 1)
-        better = fall > 0
-        start = np.where(better[:, None], starts, start)
-        lin = _choose(better, trial, lin)
-        later = np.where(is_stale, damping, np.maximum(damping, 1e-5) * 100.0)
-        damping = np.where(better, damping * 0.1, later)
-        again = open_still & (is_stale | better) & (fall < KEPT_PROMISE * promised)
-        if np.any(again):
-            fresh = linearise(problem.take(again), theta, start[again], (), ())
-            lin.start[again] = fresh.start * (lin.start_unit / fresh.start_unit)
-        is_stale = np.where(again, False, is_stale | better)
-    return start, lin
-
-
-def _promised(lin: Linearisation, residual: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return each segment's cost [S] if the initial states' effect on the residual were linear."""
-    return np.sum((residual + np.einsum("sni,si->sn", lin.start, change)) ** 2, axis=1)
-
-
-def _choose(which: np.ndarray, new: Linearisation, old: Linearisation) -> Linearisation:
-    """Take the segments `which` [S] from one linearisation and the others from another."""
-    return Linearisation(
-        np.where(which[:, None], new.residual, old.residual),
-        np.where(which[:, None, None], new.parameters, old.parameters),
-        np.where(which[:, None, None], new.start, old.start),
-        new.start_unit,
-    )
-
-
-def _start_step(lin: Linearisation, residual: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return damped Gauss-Newton changes of the initial states [S, nq + nv], in their units."""
-    normal = np.swapaxes(lin.start, 1, 2) @ lin.start
-    gradient = np.einsum("sni,sn->si", lin.start, residual)
-    diagonal = np.einsum("sii->si", normal)
-    floor = 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
-    ridge = np.maximum(damping, 1e-12)[:, None] * diagonal + floor
-    normal = normal + ridge[:, :, None] * np.eye(normal.shape[1])
-    return -np.linalg.solve(normal, gradient[..., None])[..., 0]
 
 
 def fit(
@@ -158,6 +119,82 @@ def fit(
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
     """
     theta, free = np.array(theta, float), tuple(free)
+    theta, start, lin, keep = _descend(problem, theta, start, free, iterations, rival, sensitivity)
+    start, settled, again = _settle_all(problem, theta, start, lin)
+    if again:
+        near = settled.start
+        theta, start, lin, keep = _descend(problem, theta, start, free, iterations, rival, near)
+        start, settled, _ = _settle_all(problem, theta, start, lin)
+    if _is_erratic(problem, lin):
+        theta = _search(problem, theta, start, free)
+        start, lin = _wide(problem, theta, start, free)
+        settled = lin
+    low, high = _interval(problem, theta, lin, free, keep)
+    frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
+    return Fit(theta, free, frozen, start, settled.residual, settled.start, low, high)
+
+
+def _settle_all(problem: Problem, theta, start, lin: Linearisation):
+    """Settle all initial states at a fit's end; say if those sought anew lowered its cost."""
+    if not np.all(problem.fitted):  # some of those held out did not follow
+        lin = linearise(problem, theta, start, (), (), lin.start)
+    start, lin = settle_starts(problem, theta, start, lin, SETTLE_STEPS)
+    before = np.sum(lin.residual[problem.fitted] ** 2)
+    start, lin = settle_anew(problem, theta, start, lin)
+    return start, lin, np.sum(lin.residual[problem.fitted] ** 2) < SAME * before
+
+
+def _is_erratic(problem: Problem, lin: Linearisation) -> bool:
+    """Say whether parameters change few samples much and most hardly, as contacts make them."""
+    sensitivity, _ = _projected(problem, lin)
+    return any(is_erratic(column) for column in sensitivity.T)
+
+
+def _wide(problem: Problem, theta, start, free) -> tuple[np.ndarray, Linearisation]:
+    """Measure sensitivities over wide steps, initial states settled at both ends of each.
+
+    Contacts that open or close a step of the engine earlier change what follows by an amount that
+    does not shrink with the perturbation; over a wide one these changes average out.
+    """
+    base = settle(problem, theta, start)
+    columns = []
+    for j, step in zip(free, difference_steps(problem, theta, free, WIDE), strict=True):
+        moved = theta.copy()
+        moved[j] += step
+        columns.append((settle(problem, moved, base.start).residual - base.residual) / step)
+    unit = nearby_starts(problem.segments, 1.0)
+    return base.start, Linearisation(base.residual, np.stack(columns, -1), base.sensitivity, unit)
+
+
+def _search(problem: Problem, theta, start, free) -> np.ndarray:
+    """Fit parameters by Gauss-Newton steps with `_wide` differences to some of the segments."""
+    fitted = np.flatnonzero(problem.fitted)
+    chosen = fitted[:: max(1, len(fitted) // SEARCHED)]
+    problem, start, damping = problem.take(chosen), start[chosen], 1e-4
+    start, lin = _wide(problem, theta, start, free)
+    for _ in range(SEARCH_STEPS):
+        change, _ = _parameter_step(problem, theta, lin, free, damping)
+        before = np.sum(lin.residual**2)
+        promised = np.sum((lin.residual + lin.parameters @ change) ** 2)
+        if promised > SAME * before:
+            break
+        trial = theta.copy()
+        trial[list(free)] += change
+        settled = settle(problem, trial, start)
+        if settled.cost.sum() < before:
+            theta, damping = trial, damping * 0.1
+            start, lin = _wide(problem, theta, settled.start, free)
+        else:
+            damping = max(damping, 1e-3) * 30.0
+    return theta
+
+
+def _descend(problem: Problem, theta, start, free, iterations: int, rival: float, sensitivity):
+    """Take Gauss-Newton steps of parameters and initial states together; see `fit`.
+
+    Returns:
+        Parameters, initial states, the linearisation at them, and which parameters are excited.
+    """
     damping, undamped = 1e-4, np.zeros(len(start))
 
     def at(theta, start, sensitivity) -> Linearisation:
@@ -169,9 +206,9 @@ def fit(
     for taken in range(iterations):
         change, keep = _parameter_step(problem, theta, lin, free, damping)
         expected = lin.residual + lin.parameters @ change
-        start_change = _start_step(lin, expected, undamped)
+        start_change = start_step(lin, expected, undamped)
         before = np.sum(lin.residual[problem.fitted] ** 2)
-        promised = _promised(lin, expected, start_change)[problem.fitted].sum()
+        promised = promised_costs(lin, expected, start_change)[problem.fitted].sum()
         if before - promised < FITTED * before or damping > 1e8:
             break
         if taken > 1 and promised > BEATEN * rival:
@@ -181,23 +218,24 @@ def fit(
         trial_theta[list(free)] += change
         trial = at(trial_theta, starts, lin.start)
         fall = before - np.sum(trial.residual[problem.fitted] ** 2)
+        if fall <= 0:  # perhaps for some initial states' sake only
+            stayed = at(trial_theta, start, lin.start)
+            better = np.sum(stayed.residual**2, 1) < np.sum(trial.residual**2, 1)
+            starts = np.where(better[:, None], start, starts)
+            trial = choose(better, stayed, trial)
+            fall = before - np.sum(trial.residual[problem.fitted] ** 2)
         if fall > 0:
             follows = np.sum(trial.residual**2, 1) < np.sum(lin.residual**2, 1)
             moved = problem.fitted | follows
             start = np.where(moved[:, None], starts, start)
-            theta, lin, damping = trial_theta, _choose(moved, trial, lin), damping * 0.1
+            theta, lin, damping = trial_theta, choose(moved, trial, lin), damping * 0.1
         elif not is_stale:
             damping = max(damping, 1e-3) * 30.0
         if is_stale and fall < KEPT_PROMISE * (before - promised):
             lin, is_stale = at(theta, start, None), False
         elif fall > 0:
             is_stale = True
-    low, high = _interval(problem, theta, lin, free, keep)
-    if not np.all(problem.fitted):  # some of those held out did not follow
-        lin = linearise(problem, theta, start, (), (), lin.start)
-    start, lin = _settle(problem, theta, start, lin, SETTLE_STEPS)
-    frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
-    return Fit(theta, free, frozen, start, lin.residual, lin.start, low, high)
+    return theta, start, lin, keep
 
 
 def _projected(problem: Problem, lin: Linearisation) -> tuple[np.ndarray, np.ndarray]:
@@ -263,6 +301,8 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
         return fitted
     steps = difference_steps(problem, fitted.theta, fitted.free, STEP)
     lin = linearise(problem, fitted.theta, fitted.start, fitted.free, steps)
+    if _is_erratic(problem, lin):
+        _, lin = _wide(problem, fitted.theta, fitted.start, fitted.free)
     low, high = _interval(problem, fitted.theta, lin, fitted.free, keep)
     change = 2.0 * problem.integrator_error(fitted.theta, fitted.start, lin.residual)
     sensitivity, change = _projected(problem, lin._replace(residual=change))

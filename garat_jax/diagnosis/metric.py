@@ -7,6 +7,7 @@ import numpy as np
 
 from garat_jax.diagnosis.fit import Fit
 from garat_jax.diagnosis.problem import Problem, StartSpace
+from garat_jax.diagnosis.segments import QUIET
 
 AnyProblem = TypeVar("AnyProblem", bound=Problem)
 
@@ -23,8 +24,8 @@ class Metric(NamedTuple):
         weight: Squared metric of one squared whitened residual, [N].
         counted: Which residuals are samples and not padding, [S, N].
         trust: How much each counts in a fit and in decisions, [S, N].
-        spread: Standard deviation of each signal in the held-out data, its noise at least,
-            [num_signals].
+        spread: Standard deviation of each signal in the held-out data, `QUIET` times its noise at
+            least, [num_signals].
     """
 
     weight: np.ndarray
@@ -54,7 +55,7 @@ def make_metric(problem: Problem) -> Metric:
     """Make the metric: errors relative to each signal's spread in the held-out data."""
     s = problem.segments
     held_out = (s.weight > 0) & ~problem.fitted[:, None]
-    spread = np.maximum(s.measured[held_out].std(axis=0), s.noise)
+    spread = np.maximum(s.measured[held_out].std(axis=0), QUIET * s.noise)
     weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
     num_signals = s.measured.shape[2]
     counted, trust = (np.repeat(x, num_signals, axis=1) for x in (s.weight > 0, s.trust))
@@ -73,14 +74,23 @@ def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
         settled: The model as it is, initial states fitted.
     """
     segments = problem.segments
-    change = problem.integrator_error(settled.theta, settled.start, settled.residual)
-    rest = StartSpace(settled.sensitivity).remove(change[..., None])[..., 0]
-    squares = np.minimum(
-        *(np.mean((2.0 * x).reshape(segments.measured.shape) ** 2, axis=2) for x in (change, rest))
-    )
-    size = np.sqrt(np.maximum.accumulate(squares, axis=1))
+    shape = segments.measured.shape
+    squares = [np.mean(x.reshape(shape) ** 2, axis=2) for x in timestep_error(problem, settled)]
+    size = np.sqrt(np.maximum.accumulate(np.minimum(*squares), axis=1))
     trust = 1.0 / np.maximum(1.0, size / TRUSTED)
     return dataclasses.replace(problem, segments=dataclasses.replace(segments, trust=trust))
+
+
+def timestep_error(problem: Problem, current: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return the engine's error at the model's timestep, whole and what no initial state undoes.
+
+    A first-order integrator errs by twice what half a step changes.
+
+    Returns:
+        Whitened, each [S, N].
+    """
+    change = 2.0 * problem.integrator_error(current.theta, current.start, current.residual)
+    return change, StartSpace(current.sensitivity).remove(change[..., None])[..., 0]
 
 
 class Floor(NamedTuple):
@@ -96,10 +106,9 @@ class Floor(NamedTuple):
 
 
 def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
-    """Estimate the noise floor; a first-order integrator errs by twice what half a step changes."""
+    """Estimate the noise floor."""
     held_out = ~problem.fitted
-    change = problem.integrator_error(current.theta, current.start, current.residual)
-    change = 2.0 * StartSpace(current.sensitivity).remove(change[..., None])[..., 0]
+    _, change = timestep_error(problem, current)
     noise = metric.counted * metric.trust
     return Floor(
         float(np.hypot(metric.error(noise, held_out), metric.error(change, held_out))),

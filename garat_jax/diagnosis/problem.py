@@ -20,6 +20,8 @@ BLOCK = 0.25
 """Seconds of the shortest block within which errors may be correlated, in robust variances."""
 START_STEP = 1e-4
 """Finite difference of an initial state, relative to its spread."""
+ERRATIC = 10.0
+"""Root mean square of a change, relative to its median size, above which few samples make it."""
 LARGE = 1e8
 """Whitened residual that stands for a simulation that diverged."""
 
@@ -81,17 +83,27 @@ class Problem(Generic[AnySimulator]):
     def whiten(self, predicted: np.ndarray) -> np.ndarray:
         """Return whitened residuals [..., S, N] of predictions [..., S, L, num_signals]."""
         s = self.segments
-        residual = (predicted - s.measured) * self._scale()
+        residual = (predicted - s.measured) * self.scale
         residual = np.where(np.isfinite(residual), residual, LARGE)
         return np.clip(residual, -LARGE, LARGE).reshape(*residual.shape[:-2], -1)
 
+    def unwhiten(self, residual: np.ndarray) -> np.ndarray:
+        """Return the predictions [S, L, num_signals] that made whitened residuals [S, N].
+
+        Samples that do not count come out as measured.
+        """
+        s, scale = self.segments, self.scale
+        deviation = residual.reshape(s.measured.shape) / np.where(scale > 0, scale, 1.0)
+        return s.measured + deviation
+
     def whiten_change(self, change: np.ndarray) -> np.ndarray:
         """Return changes of predictions [..., S, L, num_signals], whitened, [..., S, N]."""
-        change = change * self._scale()
+        change = change * self.scale
         change = np.where(np.isfinite(change), change, 0.0)
         return np.clip(change, -LARGE, LARGE).reshape(*change.shape[:-2], -1)
 
-    def _scale(self) -> np.ndarray:
+    @property
+    def scale(self) -> np.ndarray:
         """Return what a deviation counts, [S, L, num_signals]."""
         s = self.segments
         return (s.weight * s.trust)[..., None] / s.noise
@@ -185,6 +197,12 @@ def difference_steps(problem: Problem, theta: np.ndarray, columns, relative: flo
         size = relative * max(p.scale, 0.1 * min(abs(theta[j] - p.nominal), abs(theta[j])))
         steps.append(size if theta[j] + size <= p.high else -size)
     return np.asarray(steps)
+
+
+def is_erratic(change: np.ndarray) -> bool:
+    """Say whether a perturbation changes few of the samples [M] much and most hardly."""
+    size = np.abs(change)
+    return bool(0 < ERRATIC * np.median(size) < np.sqrt(np.mean(size**2)))
 
 
 def block_labels(problem: Problem) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, fit_contenders, fit_refinements
+from garat_jax.diagnosis.contend import Contender, fit_contenders, fit_further, fit_refinements
 from garat_jax.diagnosis.fit import Fit, count_timestep, fit, settle
 from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor
 from garat_jax.diagnosis.problem import Problem, block_labels
@@ -109,20 +109,22 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
 
 
 def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):
-    """Replace the best contender by a refinement of its law that certainly explains more.
+    """Replace the best contender where a refinement, or more of its law, certainly explains more.
 
     Screening prefers the simpler law, because a refinement's threshold hides it there.
     """
-    if not contenders:
-        return contenders
-    best = min(contenders, key=lambda c: c.fit.cost.sum())
-    if not is_above(problem, metric, best.fit, floor, REFINED_ABOVE):
-        return contenders
-    for contender in fit_refinements(problem, current, best, scores, say):
-        if _leads(problem, contender.fit, best.fit):
-            replaced = (best.score.effect, contender.score.effect)
-            others = (c for c in contenders if c.score.effect not in replaced)
-            contenders, best = [contender, *others], contender
+    for find in (
+        lambda best: fit_refinements(problem, current, best, scores, say),
+        lambda best: fit_further(problem, best, say),
+    ):
+        best = min(contenders, key=lambda c: c.fit.cost.sum(), default=None)
+        if best is None or not is_above(problem, metric, best.fit, floor, REFINED_ABOVE):
+            break
+        for contender in find(best):
+            if _leads(problem, contender.fit, best.fit):
+                replaced = (best.score.effect, contender.score.effect)
+                others = (c for c in contenders if c.score.effect not in replaced)
+                contenders, best = [contender, *others], contender
     return contenders
 
 

@@ -22,6 +22,9 @@ SMALLEST_NOISE = 1e-4
 """Noise assumed at least, relative to the signal's standard deviation."""
 UNKNOWN_NOISE = 1e-6
 """Noise assumed where no signal of a kind ever changes, in the signals' units."""
+QUIET = 10.0
+"""Multiple of its noise that a signal's spread counts as at least: a signal that hardly moves is
+predicted no better than its noise, which is no error of the model."""
 KINEMATIC_WINDOWS = np.asarray([0.04, 0.06, 0.09, 0.13, 0.2, 0.3])
 """Seconds over which position and velocity sensors are held against each other."""
 HELD_AGAINST = 0.05
@@ -42,7 +45,7 @@ class Segments:
         recording: Index of the recording, [S].
         first: Index of the first sample within its recording, [S].
         noise: Standard deviation of each signal's noise, [num_signals].
-        spread: Standard deviation of each signal, its noise at least, [num_signals].
+        spread: Standard deviation of each signal, `QUIET` times its noise at least, [num_signals].
     """
 
     measured: np.ndarray
@@ -146,7 +149,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         recording=np.asarray([i for i, _, _ in pieces]),
         first=np.asarray([a for _, a, _ in pieces]),
         noise=deviations,
-        spread=np.maximum(spread, deviations),
+        spread=np.maximum(spread, QUIET * deviations),
     )
 
 

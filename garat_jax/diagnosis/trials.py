@@ -4,11 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from garat_jax.diagnosis.problem import is_erratic
 from garat_jax.diagnosis.simulate import Simulator, columns_of
 from garat_jax.effects import Effect
 
-ERRATIC = 10.0
-"""Root mean square of a change, relative to its median size, above which few samples make it."""
 ROOM = 0.3
 """Share of the way to a bound that a step is enlarged to at most."""
 
@@ -142,11 +141,10 @@ def enlarge(
     rows, trials, larger = list(rows), list(trials), []
     for number, trial in enumerate(trials):
         (index,) = trial.rows
-        row, size = rows[index], np.abs(changes[:, index])
-        median = float(np.median(size))
-        is_erratic = 0 < ERRATIC * median < float(np.sqrt(np.mean(size**2)))
-        if not trial.is_only or len(row.values) > 1 or not is_erratic:
+        row = rows[index]
+        if not trial.is_only or len(row.values) > 1 or not is_erratic(changes[:, index]):
             continue
+        median = float(np.median(np.abs(changes[:, index])))
         p = simulator.slots[row.column].parameter
         base = row.values[row.column] - row.step
         room = abs((p.high if row.step > 0 else p.low) - base)

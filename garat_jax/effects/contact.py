@@ -57,12 +57,12 @@ class ContactEffect(Effect):
 
     @classmethod
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
-        """Start at half and at twice each number, because sticking and slipping differ."""
+        """Start at several sizes of each number, because sticking and slipping differ."""
         base = cls.at(host, target)
         return tuple(
             {p.name: float(np.clip(factor * base[p.name], p.low, p.high))}
             for p in cls.parameters()
-            for factor in (0.5, 2.0)
+            for factor in (0.5, 0.7, 1.4, 2.0)
         )
 
     @classmethod

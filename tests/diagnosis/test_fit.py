@@ -14,7 +14,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem, StartSpace
 from garat_jax.diagnosis.screen import cosine, screen
-from garat_jax.diagnosis.segments import choose_grid, cut, signal_noise
+from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, signal_noise
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.effects import ActuatorDelay
 from tests import models
@@ -196,4 +196,4 @@ def test_a_signal_that_never_changes_has_the_noise_of_its_kind():
     assert segments.noise[0] == pytest.approx(1e-3, rel=0.2)
     assert segments.noise[2] == pytest.approx(1e-2, rel=0.2)
     np.testing.assert_array_equal(segments.noise[[1, 3]], segments.noise[[0, 2]])
-    np.testing.assert_array_equal(segments.spread[[1, 3]], segments.noise[[1, 3]])
+    np.testing.assert_array_equal(segments.spread[[1, 3]], QUIET * segments.noise[[1, 3]])

@@ -138,7 +138,10 @@ def record(case: Case, seed: int, seconds: float = 4.0) -> Recording:
 @pytest.mark.parametrize("kind", CASES)
 def test_the_parameters_are_recovered(kind):
     case = CASES[kind]
-    model = Model("model", Path(__file__), Path(__file__), spec(case.mjcf))
+    source = spec(case.mjcf)
+    if kind == "contact_compliance":  # at 2 ms the engine's error in an impact is worth 5 % of it
+        source.option.timestep /= 4
+    model = Model("model", Path(__file__), Path(__file__), source)
     host = model.compile(engine="mujoco").host.model
     chosen = [
         effect

@@ -1,0 +1,103 @@
+"""Initial states of segments at fixed parameters, by damped Gauss-Newton steps of their own."""
+
+import numpy as np
+
+from garat_jax.diagnosis.problem import Linearisation, Problem, linearise
+
+SETTLED = 1e-3
+"""Fall of a segment's cost, relative to it, below which its initial state is left as it is."""
+SETTLE_STEPS = 10
+"""Steps of the initial states after a fit, whose own steps have moved them already."""
+KEPT_PROMISE = 0.5
+"""Fall of the cost, relative to the promised one, below which sensitivities are measured again."""
+POOR = 1.3
+"""Cost of a segment, relative to that of noise, above which its initial state is sought anew."""
+
+
+def settle_anew(problem: Problem, theta, start: np.ndarray, lin: Linearisation):
+    """Settle segments with much residual again, from where the segment before ends.
+
+    Noise may lift a foot off the ground or push it in, and another model's initial states may make
+    it hop, from where no small step leads back. What is reached anew counts where it is better.
+    """
+    count = np.maximum(np.count_nonzero(problem.scale.reshape(len(start), -1), axis=1), 1)
+    poor = np.sum(lin.residual**2, axis=1) > POOR * count
+    if not np.any(poor):
+        return start, lin
+    some, carried = problem.take(poor), _carried(problem, start, lin.residual)[poor]
+    fresh = linearise(some, theta, carried, (), ())
+    carried, fresh = settle_starts(some, theta, carried, fresh, SETTLE_STEPS)
+    better = np.sum(fresh.residual**2, axis=1) < np.sum(lin.residual[poor] ** 2, axis=1)
+    chosen = np.flatnonzero(poor)[better]
+    start, residual, sensitivity = start.copy(), lin.residual.copy(), lin.start.copy()
+    start[chosen], residual[chosen] = carried[better], fresh.residual[better]
+    sensitivity[chosen] = fresh.start[better] * (lin.start_unit / fresh.start_unit)
+    return start, lin._replace(residual=residual, start=sensitivity)
+
+
+def _carried(problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return where the preceding segments end, or what was measured, [S, nq + nv]."""
+    predicted = problem.unwhiten(residual)
+    segments, carried = problem.segments, problem.segments.start.copy()
+    count = np.count_nonzero(segments.weight, axis=1)
+    place = {at: i for i, at in enumerate(zip(segments.recording, segments.first, strict=True))}
+    for number, signals in enumerate(predicted):
+        after = place.get((segments.recording[number], segments.first[number] + count[number]))
+        if after is not None and count[number] > 1:
+            last, before = signals[count[number] - 1], signals[count[number] - 2]
+            carried[after] = start[after]
+            carried[after, : len(last)] = 2.0 * last - before
+    return carried
+
+
+def settle_starts(problem: Problem, theta, start, lin: Linearisation, iterations: int):
+    """Return settled initial states and the linearisation at them, from one that is near."""
+    lin = lin._replace(parameters=lin.parameters[..., :0])
+    damping, is_stale = np.full(len(start), 1e-6), np.ones(len(start), bool)
+    for _ in range(iterations):
+        change = start_step(lin, lin.residual, damping)
+        before = np.sum(lin.residual**2, 1)
+        promised = before - promised_costs(lin, lin.residual, change)
+        open_still = promised >= SETTLED * before
+        if not np.any(open_still):
+            break
+        starts = start + change * lin.start_unit
+        trial = linearise(problem, theta, starts, (), (), lin.start)
+        fall = before - np.sum(trial.residual**2, 1)
+        better = fall > 0
+        start = np.where(better[:, None], starts, start)
+        lin = choose(better, trial, lin)
+        later = np.where(is_stale, damping, np.maximum(damping, 1e-5) * 100.0)
+        damping = np.where(better, damping * 0.1, later)
+        again = open_still & (is_stale | better) & (fall < KEPT_PROMISE * promised)
+        if np.any(again):
+            fresh = linearise(problem.take(again), theta, start[again], (), ())
+            lin.start[again] = fresh.start * (lin.start_unit / fresh.start_unit)
+        is_stale = np.where(again, False, is_stale | better)
+    return start, lin
+
+
+def promised_costs(lin: Linearisation, residual: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return each segment's cost [S] if the initial states' effect on the residual were linear."""
+    return np.sum((residual + np.einsum("sni,si->sn", lin.start, change)) ** 2, axis=1)
+
+
+def choose(which: np.ndarray, new: Linearisation, old: Linearisation) -> Linearisation:
+    """Take the segments `which` [S] from one linearisation and the others from another."""
+    return Linearisation(
+        np.where(which[:, None], new.residual, old.residual),
+        np.where(which[:, None, None], new.parameters, old.parameters),
+        np.where(which[:, None, None], new.start, old.start),
+        new.start_unit,
+    )
+
+
+def start_step(lin: Linearisation, residual: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Return damped Gauss-Newton changes of the initial states [S, nq + nv], in their units."""
+    normal = np.swapaxes(lin.start, 1, 2) @ lin.start
+    gradient = np.einsum("sni,sn->si", lin.start, residual)
+    diagonal = np.einsum("sii->si", normal)
+    floor = 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
+    ridge = np.maximum(damping, 1e-12)[:, None] * diagonal + floor
+    normal = normal + ridge[:, :, None] * np.eye(normal.shape[1])
+    return -np.linalg.solve(normal, gradient[..., None])[..., 0]
