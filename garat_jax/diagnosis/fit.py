@@ -46,6 +46,8 @@ SEARCHED = 24
 """Segments with which a search is made at least, evenly chosen; each of its steps settles them."""
 SEARCH_STEPS = 6
 """Largest number of a search's Gauss-Newton steps."""
+SEARCH_ON = 0.99
+"""Cost that a step promises, relative to the present one, above which a search ends."""
 BEATEN = 2.0
 """Cost, relative to another fit's, above which a fit is not worth its last steps."""
 
@@ -127,8 +129,11 @@ def fit(
         start, settled, _ = _settle_all(problem, theta, start, lin)
     if _is_erratic(problem, lin):
         theta = _search(problem, theta, start, free)
-        start, lin = _wide(problem, theta, start, free)
-        settled = lin
+        near, lin = _wide(problem, theta, start, free)
+        start, settled = (
+            near.start,
+            settled._replace(residual=near.residual, start=near.sensitivity),
+        )
     low, high = _interval(problem, theta, lin, free, keep)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
     return Fit(theta, free, frozen, start, settled.residual, settled.start, low, high)
@@ -150,11 +155,12 @@ def _is_erratic(problem: Problem, lin: Linearisation) -> bool:
     return any(is_erratic(column) for column in sensitivity.T)
 
 
-def _wide(problem: Problem, theta, start, free) -> tuple[np.ndarray, Linearisation]:
+def _wide(problem: Problem, theta, start, free) -> tuple[Fit, Linearisation]:
     """Measure sensitivities over wide steps, initial states settled at both ends of each.
 
     Contacts that open or close a step of the engine earlier change what follows by an amount that
-    does not shrink with the perturbation; over a wide one these changes average out.
+    does not shrink with the perturbation; over a wide one these changes average out. What initial
+    states do is in these sensitivities already: those to them are 0.
     """
     base = settle(problem, theta, start)
     columns = []
@@ -162,28 +168,27 @@ def _wide(problem: Problem, theta, start, free) -> tuple[np.ndarray, Linearisati
         moved = theta.copy()
         moved[j] += step
         columns.append((settle(problem, moved, base.start).residual - base.residual) / step)
-    unit = nearby_starts(problem.segments, 1.0)
-    return base.start, Linearisation(base.residual, np.stack(columns, -1), base.sensitivity, unit)
+    nothing, unit = np.zeros_like(base.sensitivity), nearby_starts(problem.segments, 1.0)
+    return base, Linearisation(base.residual, np.stack(columns, -1), nothing, unit)
 
 
 def _search(problem: Problem, theta, start, free) -> np.ndarray:
     """Fit parameters by Gauss-Newton steps with `_wide` differences to some of the segments."""
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SEARCHED)]
-    problem, start, damping = problem.take(chosen), start[chosen], 1e-4
-    start, lin = _wide(problem, theta, start, free)
+    problem, damping = problem.take(chosen), 1e-4
+    near, lin = _wide(problem, theta, start[chosen], free)
     for _ in range(SEARCH_STEPS):
         change, _ = _parameter_step(problem, theta, lin, free, damping)
-        before = np.sum(lin.residual**2)
-        promised = np.sum((lin.residual + lin.parameters @ change) ** 2)
-        if promised > SAME * before:
+        before = near.cost.sum()
+        if np.sum((near.residual + lin.parameters @ change) ** 2) > SEARCH_ON * before:
             break
         trial = theta.copy()
         trial[list(free)] += change
-        settled = settle(problem, trial, start)
+        settled = settle(problem, trial, near.start)
         if settled.cost.sum() < before:
             theta, damping = trial, damping * 0.1
-            start, lin = _wide(problem, theta, settled.start, free)
+            near, lin = _wide(problem, theta, settled.start, free)
         else:
             damping = max(damping, 1e-3) * 30.0
     return theta
