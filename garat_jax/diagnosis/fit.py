@@ -40,14 +40,18 @@ DESCENTS = 2
 """How often a fit is done at most, where initial states that were sought anew lower its cost."""
 SAME = 0.95
 """Cost with initial states sought anew, relative to that before, above which nothing is new."""
+ALIKE = 0.9
+"""Cosine of a parameter's changes over two steps below which contacts make them, not the law."""
 WIDE = 0.5
 """Finite difference where contacts are erratic, relative to a parameter's `scale` or size."""
-SEARCHED = 24
+SEARCHED = 12
 """Segments with which a search is made at least, evenly chosen; each of its steps settles them."""
-SEARCH_STEPS = 6
-"""Largest number of a search's Gauss-Newton steps."""
+SEARCH_STEPS = 10
+"""Largest number of rounds of a search."""
 SEARCH_ON = 0.99
-"""Cost that a step promises, relative to the present one, above which a search ends."""
+"""Cost that a round reaches, relative to the one before, above which its steps were too long."""
+FINEST = 0.1
+"""Shortest steps of a search, relative to its first."""
 BEATEN = 2.0
 """Cost, relative to another fit's, above which a fit is not worth its last steps."""
 
@@ -127,13 +131,9 @@ def fit(
         near = settled.start
         theta, start, lin, keep = _descend(problem, theta, start, free, iterations, rival, near)
         start, settled, _ = _settle_all(problem, theta, start, lin)
-    if _is_erratic(problem, lin):
-        theta = _search(problem, theta, start, free)
-        near, lin = _wide(problem, theta, start, free)
-        start, settled = (
-            near.start,
-            settled._replace(residual=near.residual, start=near.sensitivity),
-        )
+    if _is_erratic(problem, theta, start, free, lin):
+        near, lin, keep = _fit_across_contacts(problem, theta, start, free)
+        theta, start, settled = near.theta, near.start, lin._replace(start=near.sensitivity)
     low, high = _interval(problem, theta, lin, free, keep)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
     return Fit(theta, free, frozen, start, settled.residual, settled.start, low, high)
@@ -149,10 +149,19 @@ def _settle_all(problem: Problem, theta, start, lin: Linearisation):
     return start, lin, np.sum(lin.residual[problem.fitted] ** 2) < SAME * before
 
 
-def _is_erratic(problem: Problem, lin: Linearisation) -> bool:
-    """Say whether parameters change few samples much and most hardly, as contacts make them."""
-    sensitivity, _ = _projected(problem, lin)
-    return any(is_erratic(column) for column in sensitivity.T)
+def _is_erratic(problem: Problem, theta, start, free, lin: Linearisation) -> bool:
+    """Say whether parameters change few samples much, and others when moved further.
+
+    Friction changes few samples, too, but the same ones.
+    """
+    narrow, _ = _projected(problem, lin)
+    if not any(is_erratic(column) for column in narrow.T):
+        return False
+    steps = 10.0 * difference_steps(problem, theta, free, STEP)
+    further, _ = _projected(problem, linearise(problem, theta, start, free, steps, lin.start))
+    size = np.linalg.norm(narrow, axis=0) * np.linalg.norm(further, axis=0)
+    alike = np.abs(np.sum(narrow * further, axis=0)) / np.maximum(size, 1e-300)
+    return bool(np.any(alike[size > 0] < ALIKE))
 
 
 def _wide(problem: Problem, theta, start, free) -> tuple[Fit, Linearisation]:
@@ -167,31 +176,64 @@ def _wide(problem: Problem, theta, start, free) -> tuple[Fit, Linearisation]:
     for j, step in zip(free, difference_steps(problem, theta, free, WIDE), strict=True):
         moved = theta.copy()
         moved[j] += step
-        columns.append((settle(problem, moved, base.start).residual - base.residual) / step)
+        columns.append((_follow(problem, moved, base).residual - base.residual) / step)
     nothing, unit = np.zeros_like(base.sensitivity), nearby_starts(problem.segments, 1.0)
     return base, Linearisation(base.residual, np.stack(columns, -1), nothing, unit)
 
 
+def _follow(problem: Problem, theta, near: Fit) -> Fit:
+    """Settle the initial states at parameters near those of a fit, with its sensitivities."""
+    lin = linearise(problem, theta, near.start, (), (), near.sensitivity)
+    start, lin = settle_starts(problem, theta, near.start, lin, SETTLE_STEPS)
+    return dataclasses.replace(
+        near, theta=theta, start=start, residual=lin.residual, sensitivity=lin.start
+    )
+
+
+def _fit_across_contacts(problem: Problem, theta, start, free):
+    """Search, then take one Gauss-Newton step with `_wide` differences if it is good.
+
+    Returns:
+        What was reached, the linearisation there, and which parameters are excited.
+    """
+    theta = _search(problem, theta, start, free)
+    near, lin = _wide(problem, theta, start, free)
+    change, keep = _parameter_step(problem, theta, lin, free, 1e-4)
+    theta = theta.copy()
+    theta[list(free)] += change
+    trial = _follow(problem, theta, near)
+    if trial.cost[problem.fitted].sum() < near.cost[problem.fitted].sum():
+        near = trial
+    return near, lin._replace(residual=near.residual), keep
+
+
 def _search(problem: Problem, theta, start, free) -> np.ndarray:
-    """Fit parameters by Gauss-Newton steps with `_wide` differences to some of the segments."""
+    """Fit parameters to some of the segments by compass search, initial states settled each time.
+
+    (Kolda, Lewis and Torczon 2003.) No derivative is trusted; steps double and shrink.
+    """
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SEARCHED)]
-    problem, damping = problem.take(chosen), 1e-4
-    near, lin = _wide(problem, theta, start[chosen], free)
+    problem = problem.take(chosen)
+    steps = np.abs(difference_steps(problem, theta, free, WIDE))
+    least, near = FINEST * steps, settle(problem, theta, start[chosen])
     for _ in range(SEARCH_STEPS):
-        change, _ = _parameter_step(problem, theta, lin, free, damping)
-        before = near.cost.sum()
-        if np.sum((near.residual + lin.parameters @ change) ** 2) > SEARCH_ON * before:
+        best, along = near, -1
+        for number, (j, step) in enumerate(zip(free, steps, strict=True)):
+            p = problem.simulator.slots[j].parameter
+            for way in (-1.0, 1.0):
+                theta = near.theta.copy()
+                theta[j] = np.clip(theta[j] + way * step, p.low, p.high)
+                trial = _follow(problem, theta, near)
+                if trial.cost.sum() < best.cost.sum():
+                    best, along = trial, number
+        if best.cost.sum() < SEARCH_ON * near.cost.sum():
+            near, steps[along] = best, 2.0 * steps[along]
+        elif np.all(steps <= least):
             break
-        trial = theta.copy()
-        trial[list(free)] += change
-        settled = settle(problem, trial, near.start)
-        if settled.cost.sum() < before:
-            theta, damping = trial, damping * 0.1
-            near, lin = _wide(problem, theta, settled.start, free)
         else:
-            damping = max(damping, 1e-3) * 30.0
-    return theta
+            steps *= 0.3
+    return near.theta
 
 
 def _descend(problem: Problem, theta, start, free, iterations: int, rival: float, sensitivity):
@@ -211,7 +253,7 @@ def _descend(problem: Problem, theta, start, free, iterations: int, rival: float
     for taken in range(iterations):
         change, keep = _parameter_step(problem, theta, lin, free, damping)
         expected = lin.residual + lin.parameters @ change
-        start_change = start_step(lin, expected, undamped)
+        start_change = start_step(problem, lin, expected, undamped)
         before = np.sum(lin.residual[problem.fitted] ** 2)
         promised = promised_costs(lin, expected, start_change)[problem.fitted].sum()
         if before - promised < FITTED * before or damping > 1e8:
@@ -306,7 +348,7 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
         return fitted
     steps = difference_steps(problem, fitted.theta, fitted.free, STEP)
     lin = linearise(problem, fitted.theta, fitted.start, fitted.free, steps)
-    if _is_erratic(problem, lin):
+    if _is_erratic(problem, fitted.theta, fitted.start, fitted.free, lin):
         _, lin = _wide(problem, fitted.theta, fitted.start, fitted.free)
     low, high = _interval(problem, fitted.theta, lin, fitted.free, keep)
     change = 2.0 * problem.integrator_error(fitted.theta, fitted.start, lin.residual)

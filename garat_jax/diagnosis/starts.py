@@ -10,6 +10,8 @@ SETTLE_STEPS = 10
 """Steps of the initial states after a fit, whose own steps have moved them already."""
 KEPT_PROMISE = 0.5
 """Fall of the cost, relative to the promised one, below which sensitivities are measured again."""
+HELD = 30.0
+"""Measurements that hold a component of an initial state where it is, in each step."""
 POOR = 1.3
 """Cost of a segment, relative to that of noise, above which its initial state is sought anew."""
 
@@ -55,7 +57,7 @@ def settle_starts(problem: Problem, theta, start, lin: Linearisation, iterations
     lin = lin._replace(parameters=lin.parameters[..., :0])
     damping, is_stale = np.full(len(start), 1e-6), np.ones(len(start), bool)
     for _ in range(iterations):
-        change = start_step(lin, lin.residual, damping)
+        change = start_step(problem, lin, lin.residual, damping)
         before = np.sum(lin.residual**2, 1)
         promised = before - promised_costs(lin, lin.residual, change)
         open_still = promised >= SETTLED * before
@@ -92,12 +94,20 @@ def choose(which: np.ndarray, new: Linearisation, old: Linearisation) -> Lineari
     )
 
 
-def start_step(lin: Linearisation, residual: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return damped Gauss-Newton changes of the initial states [S, nq + nv], in their units."""
+def start_step(
+    problem: Problem, lin: Linearisation, residual: np.ndarray, damping: np.ndarray
+) -> np.ndarray:
+    """Return damped Gauss-Newton changes of the initial states [S, nq + nv], in their units.
+
+    Every component is held as by `HELD` measurements, so that one that soon says nothing, as the
+    height of a foot on the ground, does not follow the noise of its first samples into a hop.
+    """
     normal = np.swapaxes(lin.start, 1, 2) @ lin.start
     gradient = np.einsum("sni,sn->si", lin.start, residual)
     diagonal = np.einsum("sii->si", normal)
-    floor = 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
+    floor = np.zeros_like(diagonal) + 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
+    noise = problem.segments.noise
+    floor[:, : len(noise)] += HELD * (lin.start_unit[: len(noise)] / noise) ** 2
     ridge = np.maximum(damping, 1e-12)[:, None] * diagonal + floor
     normal = normal + ridge[:, :, None] * np.eye(normal.shape[1])
     return -np.linalg.solve(normal, gradient[..., None])[..., 0]

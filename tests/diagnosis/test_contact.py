@@ -25,7 +25,7 @@ PUCK = """
 TIME = np.arange(1000) * 0.004
 
 
-def record(friction: float, seed: int) -> Recording:
+def record(friction: float, seed: int, noise: float = 1.0) -> Recording:
     rng = np.random.default_rng(seed)
     spec = mujoco.MjSpec.from_string(PUCK)
     for geom in spec.geoms:
@@ -40,7 +40,7 @@ def record(friction: float, seed: int) -> Recording:
         states.append([*data.qpos, *data.qvel])
         data.ctrl[0] = command
         mujoco.mj_step(model, data, 32)
-    states = np.asarray(states) + rng.normal(size=(1000, 4)) * [1e-4, 1e-4, 2e-3, 2e-3]
+    states = np.asarray(states) + noise * rng.normal(size=(1000, 4)) * [1e-4, 1e-4, 2e-3, 2e-3]
     return Recording(
         name=f"made {seed}",
         time=TIME,
