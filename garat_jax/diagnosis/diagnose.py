@@ -17,7 +17,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Predictor, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
-from garat_jax.diagnosis.segments import Segments, choose_grid, cut, nearby_starts
+from garat_jax.diagnosis.segments import QUIET, Segments, choose_grid, cut
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
@@ -154,7 +154,7 @@ def choose_horizon(simulator: Predictor, recordings, grid) -> tuple[float, Segme
     horizons = [h for h in HORIZONS if h <= max(longest, HORIZONS[-1])]
     segments = cut(recordings, grid, horizons[0])
     size = 1e-5
-    unit = nearby_starts(segments, size)
+    unit = size * segments.start_unit
     starts = segments.start + np.concatenate([np.zeros((1, len(unit))), np.diag(unit)])[:, None]
     thetas = np.tile(simulator.base, (len(starts), 1))
     predicted = simulator.predict(thetas, starts, segments)
@@ -207,7 +207,8 @@ def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str) 
             "unit": listed[i].unit,
         }
     return Errors(
-        metric=f"root mean square of prediction error by signal's standard deviation, {how}",
+        metric=f"root mean square of prediction error by signal's standard deviation, "
+        f"{QUIET:g} times its noise at least, {how}",
         unit="1",
         before=before,
         after=after,

@@ -6,6 +6,7 @@ as the cost falls as they promise.
 """
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 from scipy import optimize, stats
@@ -21,7 +22,6 @@ from garat_jax.diagnosis.problem import (
     tall,
 )
 from garat_jax.diagnosis.robust import regress
-from garat_jax.diagnosis.segments import nearby_starts
 from garat_jax.diagnosis.starts import (
     KEPT_PROMISE,
     SETTLE_STEPS,
@@ -36,8 +36,6 @@ STEP = 1e-2
 """Finite difference of a fit, relative to a parameter's `scale` or size."""
 FITTED = 1e-4
 """Fall of the cost, relative to it, below which a fit has converged."""
-DESCENTS = 2
-"""How often a fit is done at most, where initial states that were sought anew lower its cost."""
 SAME = 0.95
 """Cost with initial states sought anew, relative to that before, above which nothing is new."""
 ALIKE = 0.9
@@ -46,6 +44,8 @@ WIDE = 0.5
 """Finite difference where contacts are erratic, relative to a parameter's `scale` or size."""
 SEARCHED = 12
 """Segments with which a search is made at least, evenly chosen; each of its steps settles them."""
+SEARCHED_WITHIN = 4.0
+"""Cost, relative to another fit's, above which a fit is not worth a search."""
 SEARCH_STEPS = 10
 """Largest number of rounds of a search."""
 SEARCH_ON = 0.99
@@ -119,9 +119,10 @@ def fit(
         theta: Where to start, [num_parameters].
         start: Initial states to start from, [S, nq + nv].
         free: Indices of the parameters to fit.
-        iterations: Largest number of Gauss-Newton steps.
+        iterations: Largest number of Gauss-Newton steps, and again where initial states sought anew
+            lowered the cost.
         rival: Cost on the fitted segments that another fit reached; steps that promise no more than
-            `BEATEN` times that are not taken.
+            `BEATEN` times that are not taken, and contacts not searched.
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
     """
     theta, free = np.array(theta, float), tuple(free)
@@ -131,7 +132,10 @@ def fit(
         near = settled.start
         theta, start, lin, keep = _descend(problem, theta, start, free, iterations, rival, near)
         start, settled, _ = _settle_all(problem, theta, start, lin)
-    if _is_erratic(problem, theta, start, free, lin):
+    cost = settled.residual[problem.fitted] ** 2
+    if np.sum(cost) < SEARCHED_WITHIN * rival and _is_erratic(
+        problem, theta, start, free, settled.start
+    ):
         near, lin, keep = _fit_across_contacts(problem, theta, start, free)
         theta, start, settled = near.theta, near.start, lin._replace(start=near.sensitivity)
     low, high = _interval(problem, theta, lin, free, keep)
@@ -149,19 +153,22 @@ def _settle_all(problem: Problem, theta, start, lin: Linearisation):
     return start, lin, np.sum(lin.residual[problem.fitted] ** 2) < SAME * before
 
 
-def _is_erratic(problem: Problem, theta, start, free, lin: Linearisation) -> bool:
-    """Say whether parameters change few samples much, and others when moved further.
+def _is_erratic(problem: Problem, theta, start, free, sensitivity) -> bool:
+    """Say whether a parameter changes few samples much, and others when it is moved further.
 
     Friction changes few samples, too, but the same ones.
     """
-    narrow, _ = _projected(problem, lin)
-    if not any(is_erratic(column) for column in narrow.T):
-        return False
-    steps = 10.0 * difference_steps(problem, theta, free, STEP)
-    further, _ = _projected(problem, linearise(problem, theta, start, free, steps, lin.start))
-    size = np.linalg.norm(narrow, axis=0) * np.linalg.norm(further, axis=0)
-    alike = np.abs(np.sum(narrow * further, axis=0)) / np.maximum(size, 1e-300)
-    return bool(np.any(alike[size > 0] < ALIKE))
+    columns = []
+    for relative in (STEP, 10.0 * STEP):
+        steps = difference_steps(problem, theta, free, relative)
+        columns.append(
+            _projected(problem, linearise(problem, theta, start, free, steps, sensitivity))[0]
+        )
+    near, far = columns
+    size = np.linalg.norm(near, axis=0) * np.linalg.norm(far, axis=0)
+    alike = np.abs(np.sum(near * far, axis=0)) / np.maximum(size, 1e-300)
+    keep = _excited(problem, free, near) & (alike < ALIKE)
+    return any(is_erratic(column) for column in near.T[keep])
 
 
 def _wide(problem: Problem, theta, start, free) -> tuple[Fit, Linearisation]:
@@ -171,14 +178,14 @@ def _wide(problem: Problem, theta, start, free) -> tuple[Fit, Linearisation]:
     does not shrink with the perturbation; over a wide one these changes average out. What initial
     states do is in these sensitivities already: those to them are 0.
     """
-    base = settle(problem, theta, start)
+    base = _follow(problem, theta, settle(problem, theta, start))
     columns = []
     for j, step in zip(free, difference_steps(problem, theta, free, WIDE), strict=True):
         moved = theta.copy()
         moved[j] += step
         columns.append((_follow(problem, moved, base).residual - base.residual) / step)
-    nothing, unit = np.zeros_like(base.sensitivity), nearby_starts(problem.segments, 1.0)
-    return base, Linearisation(base.residual, np.stack(columns, -1), nothing, unit)
+    nothing = np.zeros_like(base.sensitivity)
+    return base, Linearisation(base.residual, np.stack(columns, -1), nothing)
 
 
 def _follow(problem: Problem, theta, near: Fit) -> Fit:
@@ -191,20 +198,23 @@ def _follow(problem: Problem, theta, near: Fit) -> Fit:
 
 
 def _fit_across_contacts(problem: Problem, theta, start, free):
-    """Search, then take one Gauss-Newton step with `_wide` differences if it is good.
+    """Search, then take one Gauss-Newton step with `_wide` differences, each if it is better.
 
     Returns:
         What was reached, the linearisation there, and which parameters are excited.
     """
-    theta = _search(problem, theta, start, free)
-    near, lin = _wide(problem, theta, start, free)
-    change, keep = _parameter_step(problem, theta, lin, free, 1e-4)
-    theta = theta.copy()
+    found = _search(problem, theta, start, free)
+    near = min((settle(problem, at, start) for at in (theta, found)), key=partial(_cost, problem))
+    near, lin = _wide(problem, near.theta, near.start, free)
+    change, keep = _parameter_step(problem, near.theta, lin, free, 1e-4)
+    theta = near.theta.copy()
     theta[list(free)] += change
-    trial = _follow(problem, theta, near)
-    if trial.cost[problem.fitted].sum() < near.cost[problem.fitted].sum():
-        near = trial
+    near = min((near, _follow(problem, theta, near)), key=partial(_cost, problem))
     return near, lin._replace(residual=near.residual), keep
+
+
+def _cost(problem: Problem, of: Fit) -> float:
+    return float(of.cost[problem.fitted].sum())
 
 
 def _search(problem: Problem, theta, start, free) -> np.ndarray:
@@ -216,7 +226,7 @@ def _search(problem: Problem, theta, start, free) -> np.ndarray:
     chosen = fitted[:: max(1, len(fitted) // SEARCHED)]
     problem = problem.take(chosen)
     steps = np.abs(difference_steps(problem, theta, free, WIDE))
-    least, near = FINEST * steps, settle(problem, theta, start[chosen])
+    least, near = FINEST * steps, _follow(problem, theta, settle(problem, theta, start[chosen]))
     for _ in range(SEARCH_STEPS):
         best, along = near, -1
         for number, (j, step) in enumerate(zip(free, steps, strict=True)):
@@ -253,14 +263,14 @@ def _descend(problem: Problem, theta, start, free, iterations: int, rival: float
     for taken in range(iterations):
         change, keep = _parameter_step(problem, theta, lin, free, damping)
         expected = lin.residual + lin.parameters @ change
-        start_change = start_step(problem, lin, expected, undamped)
+        start_change = start_step(problem, lin, expected, undamped, 0.0)
         before = np.sum(lin.residual[problem.fitted] ** 2)
         promised = promised_costs(lin, expected, start_change)[problem.fitted].sum()
         if before - promised < FITTED * before or damping > 1e8:
             break
         if taken > 1 and promised > BEATEN * rival:
             break
-        starts = start + start_change * lin.start_unit
+        starts = start + start_change * problem.segments.start_unit
         trial_theta = theta.copy()
         trial_theta[list(free)] += change
         trial = at(trial_theta, starts, lin.start)
@@ -348,10 +358,11 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
         return fitted
     steps = difference_steps(problem, fitted.theta, fitted.free, STEP)
     lin = linearise(problem, fitted.theta, fitted.start, fitted.free, steps)
-    if _is_erratic(problem, fitted.theta, fitted.start, fitted.free, lin):
+    if _is_erratic(problem, fitted.theta, fitted.start, fitted.free, fitted.sensitivity):
         _, lin = _wide(problem, fitted.theta, fitted.start, fitted.free)
     low, high = _interval(problem, fitted.theta, lin, fitted.free, keep)
-    change = 2.0 * problem.integrator_error(fitted.theta, fitted.start, lin.residual)
+    change = 2.0 * problem.integrator_error(fitted.theta, fitted.start, fitted.residual)
+    change = StartSpace(fitted.sensitivity).remove(change[..., None])[..., 0]
     sensitivity, change = _projected(problem, lin._replace(residual=change))
     shift = np.zeros(len(keep))
     labels = block_labels(problem)[problem.fitted].ravel()

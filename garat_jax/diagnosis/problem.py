@@ -12,7 +12,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import mujoco
 import numpy as np
 
-from garat_jax.diagnosis.segments import Segments, nearby_starts
+from garat_jax.diagnosis.segments import Segments
 from garat_jax.diagnosis.simulate import Slot
 from garat_jax.effects import Effect
 
@@ -133,15 +133,13 @@ class Linearisation(NamedTuple):
     Attributes:
         residual: [S, N].
         parameters: Derivatives by the free parameters, [S, N, num_free].
-        start: Derivatives by the initial state's components, in units of `start_unit`,
-            [S, N, nq + nv].
-        start_unit: [nq + nv].
+        start: Derivatives by the initial state's components, in units of the segments'
+            `start_unit`, [S, N, nq + nv].
     """
 
     residual: np.ndarray
     parameters: np.ndarray
     start: np.ndarray
-    start_unit: np.ndarray
 
 
 def linearise(
@@ -158,7 +156,7 @@ def linearise(
         sensitivity: Derivatives by the initial states from nearby, [S, N, nq + nv]; they are most
             of the simulations and change little.
     """
-    unit = nearby_starts(problem.segments, 1.0)
+    unit = problem.segments.start_unit
     num_start = len(unit) if sensitivity is None else 0
     thetas = np.tile(theta, (1 + len(columns) + num_start, 1))
     thetas[1 + np.arange(len(columns)), list(columns)] += steps
@@ -169,7 +167,7 @@ def linearise(
     changes = np.moveaxis(residuals[1:] - residuals[0], 0, -1)
     parameters = changes[..., : len(columns)] / np.asarray(steps, float)
     by_start = changes[..., len(columns) :] / START_STEP if sensitivity is None else sensitivity
-    return Linearisation(residuals[0], parameters, by_start, unit)
+    return Linearisation(residuals[0], parameters, by_start)
 
 
 class StartSpace:

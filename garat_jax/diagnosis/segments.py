@@ -46,6 +46,7 @@ class Segments:
         first: Index of the first sample within its recording, [S].
         noise: Standard deviation of each signal's noise, [num_signals].
         spread: Standard deviation of each signal, `QUIET` times its noise at least, [num_signals].
+        start_unit: What the initial states differ by, a unit of each component, [nq + nv].
     """
 
     measured: np.ndarray
@@ -58,9 +59,10 @@ class Segments:
     first: np.ndarray
     noise: np.ndarray
     spread: np.ndarray
+    start_unit: np.ndarray
 
     def take(self, chosen: np.ndarray) -> "Segments":
-        """Return some of the segments; noise and spread stay those of all."""
+        """Return some of the segments; noise, spread and units stay those of all."""
         by_segment = ("measured", "weight", "trust", "start", "ctrl", "place", "recording", "first")
         parts = {name: getattr(self, name)[chosen] for name in by_segment}
         return dataclasses.replace(self, **parts)
@@ -150,7 +152,14 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         first=np.asarray([a for _, a, _ in pieces]),
         noise=deviations,
         spread=np.maximum(spread, QUIET * deviations),
+        start_unit=_unit(start),
     )
+
+
+def _unit(start: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of each component, a thousandth of the largest at least."""
+    spread = start.std(axis=0)
+    return np.maximum(spread, 1e-3 * max(float(spread.max()), 1e-3))
 
 
 def _noise_of_still(noise: np.ndarray, is_still: np.ndarray) -> np.ndarray:
@@ -233,9 +242,3 @@ def _piece(recording: Recording, a: int, b: int, length: int, steps: int, warm_u
         place = np.pad((recording.time[a:b] - recording.time[a]) / grid.interval, padding)
     ctrl = recording.ctrl[np.clip(held, 0, len(recording.time) - 1)]
     return measured, weight, state[a], ctrl, np.minimum(place, steps)
-
-
-def nearby_starts(segments: Segments, size: float) -> np.ndarray:
-    """Return each initial-state component's perturbation, relative to its spread, [nq + nv]."""
-    spread = segments.start.std(axis=0)
-    return size * np.maximum(spread, 1e-3 * max(float(spread.max()), 1e-3))

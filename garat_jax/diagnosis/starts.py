@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from garat_jax.diagnosis.problem import Linearisation, Problem, linearise
+from garat_jax.diagnosis.problem import LARGE, Linearisation, Problem, linearise
 
 SETTLED = 1e-3
 """Fall of a segment's cost, relative to it, below which its initial state is left as it is."""
@@ -11,7 +11,9 @@ SETTLE_STEPS = 10
 KEPT_PROMISE = 0.5
 """Fall of the cost, relative to the promised one, below which sensitivities are measured again."""
 HELD = 30.0
-"""Measurements that hold a component of an initial state where it is, in each step."""
+"""Measurements that hold a component of an initial state where it is, in each step of settling: one
+that soon says nothing, as the height of a foot on the ground, is not to follow the noise of its
+first samples into a hop."""
 POOR = 1.3
 """Cost of a segment, relative to that of noise, above which its initial state is sought anew."""
 
@@ -22,8 +24,8 @@ def settle_anew(problem: Problem, theta, start: np.ndarray, lin: Linearisation):
     Noise may lift a foot off the ground or push it in, and another model's initial states may make
     it hop, from where no small step leads back. What is reached anew counts where it is better.
     """
-    count = np.maximum(np.count_nonzero(problem.scale.reshape(len(start), -1), axis=1), 1)
-    poor = np.sum(lin.residual**2, axis=1) > POOR * count
+    expected = np.sum((problem.scale * problem.segments.noise) ** 2, axis=(1, 2))
+    poor = np.sum(lin.residual**2, axis=1) > POOR * expected
     if not np.any(poor):
         return start, lin
     some, carried = problem.take(poor), _carried(problem, start, lin.residual)[poor]
@@ -33,19 +35,23 @@ def settle_anew(problem: Problem, theta, start: np.ndarray, lin: Linearisation):
     chosen = np.flatnonzero(poor)[better]
     start, residual, sensitivity = start.copy(), lin.residual.copy(), lin.start.copy()
     start[chosen], residual[chosen] = carried[better], fresh.residual[better]
-    sensitivity[chosen] = fresh.start[better] * (lin.start_unit / fresh.start_unit)
+    sensitivity[chosen] = fresh.start[better]
     return start, lin._replace(residual=residual, start=sensitivity)
 
 
 def _carried(problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Return where the preceding segments end, or what was measured, [S, nq + nv]."""
+    """Return where the preceding segments end, or what was measured, [S, nq + nv].
+
+    Of some segments, only those present count; where one diverged, what follows was measured.
+    """
     predicted = problem.unwhiten(residual)
     segments, carried = problem.segments, problem.segments.start.copy()
     count = np.count_nonzero(segments.weight, axis=1)
     place = {at: i for i, at in enumerate(zip(segments.recording, segments.first, strict=True))}
     for number, signals in enumerate(predicted):
         after = place.get((segments.recording[number], segments.first[number] + count[number]))
-        if after is not None and count[number] > 1:
+        diverged = np.abs(residual[number]).max() >= LARGE
+        if after is not None and count[number] > 1 and not diverged:
             last, before = signals[count[number] - 1], signals[count[number] - 2]
             carried[after] = start[after]
             carried[after, : len(last)] = 2.0 * last - before
@@ -57,13 +63,13 @@ def settle_starts(problem: Problem, theta, start, lin: Linearisation, iterations
     lin = lin._replace(parameters=lin.parameters[..., :0])
     damping, is_stale = np.full(len(start), 1e-6), np.ones(len(start), bool)
     for _ in range(iterations):
-        change = start_step(problem, lin, lin.residual, damping)
+        change = start_step(problem, lin, lin.residual, damping, HELD)
         before = np.sum(lin.residual**2, 1)
         promised = before - promised_costs(lin, lin.residual, change)
         open_still = promised >= SETTLED * before
         if not np.any(open_still):
             break
-        starts = start + change * lin.start_unit
+        starts = start + change * problem.segments.start_unit
         trial = linearise(problem, theta, starts, (), (), lin.start)
         fall = before - np.sum(trial.residual**2, 1)
         better = fall > 0
@@ -74,7 +80,7 @@ def settle_starts(problem: Problem, theta, start, lin: Linearisation, iterations
         again = open_still & (is_stale | better) & (fall < KEPT_PROMISE * promised)
         if np.any(again):
             fresh = linearise(problem.take(again), theta, start[again], (), ())
-            lin.start[again] = fresh.start * (lin.start_unit / fresh.start_unit)
+            lin.start[again] = fresh.start
         is_stale = np.where(again, False, is_stale | better)
     return start, lin
 
@@ -90,24 +96,27 @@ def choose(which: np.ndarray, new: Linearisation, old: Linearisation) -> Lineari
         np.where(which[:, None], new.residual, old.residual),
         np.where(which[:, None, None], new.parameters, old.parameters),
         np.where(which[:, None, None], new.start, old.start),
-        new.start_unit,
     )
 
 
 def start_step(
-    problem: Problem, lin: Linearisation, residual: np.ndarray, damping: np.ndarray
+    problem: Problem, lin: Linearisation, residual: np.ndarray, damping: np.ndarray, held: float
 ) -> np.ndarray:
     """Return damped Gauss-Newton changes of the initial states [S, nq + nv], in their units.
 
-    Every component is held as by `HELD` measurements, so that one that soon says nothing, as the
-    height of a foot on the ground, does not follow the noise of its first samples into a hop.
+    Args:
+        problem: What is fitted.
+        lin: Its linearisation.
+        residual: [S, N].
+        damping: Of each segment, relative to what it says, [S].
+        held: Measurements that hold every component where it is.
     """
     normal = np.swapaxes(lin.start, 1, 2) @ lin.start
     gradient = np.einsum("sni,sn->si", lin.start, residual)
     diagonal = np.einsum("sii->si", normal)
     floor = np.zeros_like(diagonal) + 1e-12 * diagonal.max(axis=1, keepdims=True) + 1e-300
     noise = problem.segments.noise
-    floor[:, : len(noise)] += HELD * (lin.start_unit[: len(noise)] / noise) ** 2
+    floor[:, : len(noise)] += held * (problem.segments.start_unit[: len(noise)] / noise) ** 2
     ridge = np.maximum(damping, 1e-12)[:, None] * diagonal + floor
     normal = normal + ridge[:, :, None] * np.eye(normal.shape[1])
     return -np.linalg.solve(normal, gradient[..., None])[..., 0]

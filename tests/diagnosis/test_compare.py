@@ -118,6 +118,7 @@ def handmade(predicted, measured, weight) -> Replay:
         first=np.arange(len(measured)) * measured.shape[1],
         noise=np.asarray([0.1]),
         spread=np.asarray([2.0]),
+        start_unit=np.ones(1),
     )
     return Replay(1.0, ("qpos.hinge",), ("rad",), segments, predicted)
 
