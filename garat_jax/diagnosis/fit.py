@@ -112,7 +112,8 @@ def fit(
     """Fit some parameters within their bounds, and every initial state.
 
     Parameters see the fitted segments only. The initial states of those held out follow as long as
-    that lowers their own cost, and are settled at the end.
+    that lowers their own cost, and are settled at the end. Where contacts make derivatives erratic,
+    a search goes on from what Gauss-Newton steps have reached.
 
     Args:
         problem: What is fitted.
@@ -122,7 +123,7 @@ def fit(
         iterations: Largest number of Gauss-Newton steps, and again where initial states sought anew
             lowered the cost.
         rival: Cost on the fitted segments that another fit reached; steps that promise no more than
-            `BEATEN` times that are not taken, and contacts not searched.
+            `BEATEN` times that are not taken; beyond `SEARCHED_WITHIN` times there is no search.
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
     """
     theta, free = np.array(theta, float), tuple(free)
