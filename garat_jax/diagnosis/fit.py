@@ -128,15 +128,14 @@ def fit(
     """
     theta, free = np.array(theta, float), tuple(free)
     theta, start, lin, keep = _descend(problem, theta, start, free, iterations, rival, sensitivity)
-    start, settled, again = _settle_all(problem, theta, start, lin)
+    descended = start
+    start, settled, again = _settle_all(problem, theta, descended, lin)
     if again:
         near = settled.start
-        theta, start, lin, keep = _descend(problem, theta, start, free, iterations, rival, near)
-        start, settled, _ = _settle_all(problem, theta, start, lin)
+        theta, descended, lin, keep = _descend(problem, theta, start, free, iterations, rival, near)
+        start, settled, _ = _settle_all(problem, theta, descended, lin)
     cost = settled.residual[problem.fitted] ** 2
-    if np.sum(cost) < SEARCHED_WITHIN * rival and _is_erratic(
-        problem, theta, start, free, settled.start
-    ):
+    if np.sum(cost) < SEARCHED_WITHIN * rival and _is_erratic(problem, theta, descended, free, lin):
         near, lin, keep = _fit_across_contacts(problem, theta, start, free)
         theta, start, settled = near.theta, near.start, lin._replace(start=near.sensitivity)
     low, high = _interval(problem, theta, lin, free, keep)
@@ -154,22 +153,20 @@ def _settle_all(problem: Problem, theta, start, lin: Linearisation):
     return start, lin, np.sum(lin.residual[problem.fitted] ** 2) < SAME * before
 
 
-def _is_erratic(problem: Problem, theta, start, free, sensitivity) -> bool:
+def _is_erratic(problem: Problem, theta, start, free, lin: Linearisation) -> bool:
     """Say whether a parameter changes few samples much, and others when it is moved further.
 
     Friction changes few samples, too, but the same ones.
     """
-    columns = []
-    for relative in (STEP, 10.0 * STEP):
-        steps = difference_steps(problem, theta, free, relative)
-        columns.append(
-            _projected(problem, linearise(problem, theta, start, free, steps, sensitivity))[0]
-        )
-    near, far = columns
+    near = _projected(problem, lin)[0]
+    keep = _excited(problem, free, near) & [is_erratic(column) for column in near.T]
+    if not np.any(keep):
+        return False
+    steps = difference_steps(problem, theta, free, 10.0 * STEP)
+    far = _projected(problem, linearise(problem, theta, start, free, steps, lin.start))[0]
     size = np.linalg.norm(near, axis=0) * np.linalg.norm(far, axis=0)
     alike = np.abs(np.sum(near * far, axis=0)) / np.maximum(size, 1e-300)
-    keep = _excited(problem, free, near) & (alike < ALIKE)
-    return any(is_erratic(column) for column in near.T[keep])
+    return bool(np.any(alike[keep] < ALIKE))
 
 
 def _wide(problem: Problem, theta, start, free) -> tuple[Fit, Linearisation]:
@@ -359,7 +356,7 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
         return fitted
     steps = difference_steps(problem, fitted.theta, fitted.free, STEP)
     lin = linearise(problem, fitted.theta, fitted.start, fitted.free, steps)
-    if _is_erratic(problem, fitted.theta, fitted.start, fitted.free, fitted.sensitivity):
+    if _is_erratic(problem, fitted.theta, fitted.start, fitted.free, lin):
         _, lin = _wide(problem, fitted.theta, fitted.start, fitted.free)
     low, high = _interval(problem, fitted.theta, lin, fitted.free, keep)
     change = 2.0 * problem.integrator_error(fitted.theta, fitted.start, fitted.residual)

@@ -16,6 +16,9 @@ that soon says nothing, as the height of a foot on the ground, is not to follow 
 first samples into a hop."""
 POOR = 1.3
 """Cost of a segment, relative to that of noise, above which its initial state is sought anew."""
+SMOOTH = 0.3
+"""How far the change of the residual towards another initial state is from that which sensitivities
+promise, relative to it, below which both lead to the same settled state."""
 
 
 def settle_anew(problem: Problem, theta, start: np.ndarray, lin: Linearisation):
@@ -25,18 +28,34 @@ def settle_anew(problem: Problem, theta, start: np.ndarray, lin: Linearisation):
     it hop, from where no small step leads back. What is reached anew counts where it is better.
     """
     expected = np.sum((problem.scale * problem.segments.noise) ** 2, axis=(1, 2))
-    poor = np.sum(lin.residual**2, axis=1) > POOR * expected
-    if not np.any(poor):
+    poor = np.flatnonzero(np.sum(lin.residual**2, axis=1) > POOR * expected)
+    if not len(poor):
         return start, lin
-    some, carried = problem.take(poor), _carried(problem, start, lin.residual)[poor]
+    carried = _carried(problem, start, lin.residual)
+    poor = poor[_is_beyond_sensitivity(problem, theta, start, lin, carried, poor)]
+    if not len(poor):
+        return start, lin
+    some, carried = problem.take(poor), carried[poor]
     fresh = linearise(some, theta, carried, (), ())
     carried, fresh = settle_starts(some, theta, carried, fresh, SETTLE_STEPS)
     better = np.sum(fresh.residual**2, axis=1) < np.sum(lin.residual[poor] ** 2, axis=1)
-    chosen = np.flatnonzero(poor)[better]
+    chosen = poor[better]
     start, residual, sensitivity = start.copy(), lin.residual.copy(), lin.start.copy()
     start[chosen], residual[chosen] = carried[better], fresh.residual[better]
     sensitivity[chosen] = fresh.start[better]
     return start, lin._replace(residual=residual, start=sensitivity)
+
+
+def _is_beyond_sensitivity(
+    problem: Problem, theta, start: np.ndarray, lin: Linearisation, other: np.ndarray, chosen
+) -> np.ndarray:
+    """Say of chosen segments [C] whether sensitivities fail to promise what another start does."""
+    sensitivity, change = lin.start[chosen], (other - start)[chosen] / problem.segments.start_unit
+    promised = np.einsum("sni,si->sn", sensitivity, change)
+    there = linearise(problem.take(chosen), theta, other[chosen], (), (), sensitivity)
+    found = there.residual - lin.residual[chosen]
+    gap = np.sum((found - promised) ** 2, axis=1)
+    return gap > SMOOTH**2 * np.sum(promised**2, axis=1)
 
 
 def _carried(problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.ndarray:
