@@ -166,21 +166,28 @@ def evaluate(
     key: jax.Array,
     num_episodes: int,
 ) -> jax.Array:
-    """Return the undiscounted returns [num_episodes] of whole episodes."""
+    """Return undiscounted returns [num_episodes] of whole episodes; stop when all have ended."""
     shares = split.num_shares(num_episodes)
+    reset_key, key = jax.random.split(key)
+    keys = jax.random.split(key, env.episode_length)
 
-    def step(carry, key):
-        state, alive, total = carry
+    def is_unfinished(carry) -> jax.Array:
+        return carry[1]
+
+    def step(carry):
+        length, _, state, alive, total = carry
+        key = keys[length]
         state, transition, _ = _step(env, params, policy, policy_params, state, key, shares)
         total = total + alive * transition.reward
         alive = alive & ~(transition.terminated | transition.truncated)
-        return (state, alive, total), None
+        length = length + 1
+        goes_on = (length < env.episode_length) & split.anywhere(alive.any())
+        return length, goes_on, state, alive, total
 
-    reset_key, key = jax.random.split(key)
     state = split.own_share(reset(env, params, reset_key, num_episodes), shares)
-    carry = (state, jnp.ones_like(state.steps, bool), jnp.zeros(state.steps.shape))
-    keys = jax.random.split(key, env.episode_length)
-    return split.join(jax.lax.scan(step, carry, keys)[0][2], shares)
+    alive, total = jnp.ones_like(state.steps, bool), jnp.zeros(state.steps.shape)
+    carry = (0, jnp.ones((), bool), state, alive, total)
+    return split.join(jax.lax.while_loop(is_unfinished, step, carry)[4], shares)
 
 
 def replay(env: Env, params: Params, recorded: Recorded, key: jax.Array) -> jax.Array:

@@ -108,6 +108,12 @@ def own_share(tree: Any, shares: int, axis: int = 0) -> Any:
     return jax.tree.map(cut, tree)
 
 
+def anywhere(flag: jax.Array) -> jax.Array:
+    """Say whether a flag [] is set on any device: what ends a loop has to end it on all at once."""
+    axes = tuple(jax.sharding.get_abstract_mesh().manual_axes)
+    return jax.lax.pmax(flag.astype(jnp.int32), axes) > 0 if axes else flag
+
+
 def join(tree: Any, shares: int, axis: int = 0) -> Any:
     """Put the shares of all devices together along an axis."""
     if shares == 1:

@@ -1,6 +1,5 @@
 """Is an effect the same in every recording? Each is fitted alone, and the sizes are compared."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -77,8 +76,9 @@ def repeatability(
     sightings: dict[int, list[Sighting]] = {j: [] for j in free}
     for index, recording in enumerate(everything):
         say(f"fitting {recording.name} alone")
-        alone = dataclasses.replace(whole, fitted=segments.recording == index)
-        found = count_timestep(alone, fit(alone, theta, start, free))
+        own = segments.recording == index
+        alone = whole.take(own)
+        found = count_timestep(alone, fit(alone, theta, start[own], free))
         for place, j in enumerate(free):
             seen = j not in found.frozen
             numbers = (found.theta[j], found.low[place], found.high[place])
