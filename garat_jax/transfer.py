@@ -25,7 +25,7 @@ from garat_jax.env import Env, Task, World, make_world
 from garat_jax.methods.garat import GARAT, GARATConfig
 from garat_jax.methods.gat import GAT, GATConfig
 from garat_jax.methods.grounded import GroundedEnv, Grounding
-from garat_jax.methods.transition_error import constant_errors, transition_error
+from garat_jax.methods.transition_error import best_constant, constant_error, transition_error
 from garat_jax.rollout import Recorded
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer, UntilSolved
@@ -362,17 +362,13 @@ def _errors(
     source = experiment.worlds.source
 
     def errors(transformer: Params, recorded: Recorded, held_out: Recorded):
-        best = jnp.argmin(constant_errors(source.env, source.params, recorded))
-        transitions = held_out.transitions
-        still = transitions._replace(action=jnp.zeros_like(transitions.action))
+        best = best_constant(source.env, source.params, recorded)
         grounding = Grounding(source.params, transformer)
         return {
             "source": transition_error(source.env, source.params, held_out),
             "grounded": transition_error(grounded, grounding, held_out),
-            "zero_action": transition_error(
-                source.env, source.params, held_out._replace(transitions=still)
-            ),
-            "constant_action": constant_errors(source.env, source.params, held_out)[best],
+            "zero_action": constant_error(source.env, source.params, held_out, 0.0),
+            "constant_action": constant_error(source.env, source.params, held_out, best),
         }
 
     return jax.tree.map(np.asarray, experiment.map(errors, transformer, recorded, held_out))

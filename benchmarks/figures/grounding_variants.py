@@ -25,7 +25,7 @@ from garat_jax.env import make_world
 from garat_jax.envs.pairs import PAIRS
 from garat_jax.errors import DivergedError, choose
 from garat_jax.methods.garat import GARATConfig
-from garat_jax.methods.transition_error import constant_errors, transition_error
+from garat_jax.methods.transition_error import best_constant, constant_error, transition_error
 from garat_jax.presets import garat, garat_paper
 from garat_jax.rollout import Recorded
 from garat_jax.runs import RunDirectory
@@ -120,10 +120,9 @@ def baselines(experiment: Experiment, recorded: Recorded, held_out: Recorded) ->
     source = experiment.worlds.source
 
     def ratios(recorded: Recorded, held_out: Recorded):
-        still = held_out.transitions._replace(action=jnp.zeros_like(held_out.transitions.action))
-        zero = transition_error(source.env, source.params, held_out._replace(transitions=still))
-        best = jnp.argmin(constant_errors(source.env, source.params, recorded))
-        constant = constant_errors(source.env, source.params, held_out)[best]
+        best = best_constant(source.env, source.params, recorded)
+        zero = constant_error(source.env, source.params, held_out, 0.0)
+        constant = constant_error(source.env, source.params, held_out, best)
         return jnp.stack([zero, constant]) / transition_error(source.env, source.params, held_out)
 
     found = np.asarray(experiment.map(ratios, recorded, held_out)).T

@@ -20,14 +20,18 @@ def transition_error(env: Env, params: Params, recorded: Recorded) -> jax.Array:
     return jnp.mean(jnp.linalg.norm(next_obs - wanted, axis=-1))
 
 
-def constant_errors(env: Env, params: Params, recorded: Recorded) -> jax.Array:
-    """Return the transition error of each constant action over the range, [CONSTANT_ACTIONS]."""
+def constant_error(
+    env: Env, params: Params, recorded: Recorded, action: jax.Array | float
+) -> jax.Array:
+    """Return the transition error [] with the same action [action_size] in every step."""
+    transitions = recorded.transitions
+    fixed = transitions._replace(action=jnp.broadcast_to(action, transitions.action.shape))
+    return transition_error(env, params, recorded._replace(transitions=fixed))
+
+
+def best_constant(env: Env, params: Params, recorded: Recorded) -> jax.Array:
+    """Return the action [action_size], one of `CONSTANT_ACTIONS`, of least transition error."""
     fractions = jnp.linspace(0.0, 1.0, CONSTANT_ACTIONS)
     actions = env.action_low + fractions[:, None] * (env.action_high - env.action_low)
-
-    def error(action: jax.Array) -> jax.Array:
-        transitions = recorded.transitions
-        fixed = transitions._replace(action=jnp.broadcast_to(action, transitions.action.shape))
-        return transition_error(env, params, recorded._replace(transitions=fixed))
-
-    return jax.lax.map(error, actions)
+    errors = jax.lax.map(lambda action: constant_error(env, params, recorded, action), actions)
+    return actions[jnp.argmin(errors)]

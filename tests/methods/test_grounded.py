@@ -13,7 +13,12 @@ from garat_jax.methods.grounded import (
     TransformerParams,
     decode_action,
 )
-from garat_jax.methods.transition_error import CONSTANT_ACTIONS, constant_errors, transition_error
+from garat_jax.methods.transition_error import (
+    CONSTANT_ACTIONS,
+    best_constant,
+    constant_error,
+    transition_error,
+)
 from tests.probe_envs import Walk, WalkParams
 
 ENV = Walk()  # actions from -2 to 1: middle -0.5, half-range 1.5
@@ -122,12 +127,22 @@ def test_transition_error_is_the_mean_distance():
     )
 
 
-def test_constant_errors_try_the_whole_range_and_zero_action_is_among_the_baselines():
-    def still(params, obs, key):
+def record_constant(action: float) -> rollout.Recorded:
+    def constant(params, obs, key):
         del params, obs, key
-        return jnp.zeros(1), jnp.zeros(())
+        return jnp.full(1, action), jnp.zeros(())
 
-    recorded = rollout.record(ENV, PARAMS, still, (), jax.random.key(6), 2, 5)
-    errors = constant_errors(ENV, PARAMS, recorded)
-    actions = np.linspace(-2, 1, CONSTANT_ACTIONS)
-    np.testing.assert_allclose(errors, 0.2 * np.abs(actions), atol=1e-6)
+    return rollout.record(ENV, PARAMS, constant, (), jax.random.key(6), 2, 5)
+
+
+def test_the_error_of_a_constant_action_is_what_it_moves_otherwise():
+    recorded = record_constant(0.0)
+    assert constant_error(ENV, PARAMS, recorded, 0.0) == pytest.approx(0.0, abs=1e-6)
+    assert constant_error(ENV, PARAMS, recorded, -1.5) == pytest.approx(0.3, rel=1e-5)
+
+
+@pytest.mark.parametrize("number", [0, 7, CONSTANT_ACTIONS - 1])
+def test_the_best_constant_action_is_sought_over_the_whole_range(number):
+    action = np.linspace(-2, 1, CONSTANT_ACTIONS)[number]
+    recorded = record_constant(float(action))
+    assert best_constant(ENV, PARAMS, recorded) == pytest.approx(action)
