@@ -11,7 +11,7 @@ from garat_jax.diagnosis.fit import settle
 from garat_jax.diagnosis.measurements import Recording, estimate_velocity, signals
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.segments import Segments, choose_grid, cut
+from garat_jax.diagnosis.segments import Grid, Segments, choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 
 
@@ -88,24 +88,35 @@ class Replay:
 
 
 def replay(
-    model: Model, recordings: Sequence[Recording], horizons: Sequence[float]
+    model: Model, recordings: Sequence[Recording], horizons: Mapping[float, Sequence[int]]
 ) -> tuple[Replay, ...]:
     """Predict recordings over some horizons, the initial state of each segment fitted to it.
 
     Args:
         model: The model, with its effects.
         recordings: What was measured.
-        horizons: Seconds of a segment.
+        horizons: Seconds of a segment, and the numbers of the recordings to predict over it.
     """
     timestep = model.compile(engine="mujoco").host.model.opt.timestep
     grid = choose_grid(recordings, timestep)
     simulator = Simulator(model, (), grid)
-    return tuple(replay_with(simulator, recordings, grid, horizon) for horizon in horizons)
+    return tuple(
+        replay_with(simulator, recordings, grid, horizon, chosen)
+        for horizon, chosen in horizons.items()
+    )
 
 
-def replay_with(simulator: Simulator, recordings: Sequence[Recording], grid, horizon) -> Replay:
-    """Predict recordings with a simulator that is compiled already; see `replay`."""
+def replay_with(
+    simulator: Simulator,
+    recordings: Sequence[Recording],
+    grid: Grid,
+    horizon: float,
+    chosen: Sequence[int] | None = None,
+) -> Replay:
+    """Predict all recordings, or chosen ones, with a simulator that is compiled; see `replay`."""
     segments = cut(recordings, grid, horizon)
+    if chosen is not None:
+        segments = segments.take(np.isin(segments.recording, list(chosen)))
     sample = grid.interval * grid.per_sample
     everywhere = np.ones(len(segments.start), bool)
     problem = Problem(simulator, simulator, segments, everywhere, sample)

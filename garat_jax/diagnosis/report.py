@@ -107,11 +107,11 @@ def diagnosis_sections(
         holdout: Those that it was given to hold out.
     """
     fitted, held_out, _ = split(recordings, holdout)
-    view = look(model, (*fitted, *held_out), diagnosis.selected)
-    shown = range(len(fitted), len(view.recordings))
+    everything = (*fitted, *held_out)
+    view = look(model, everything, range(len(fitted), len(everything)), diagnosis.selected)
     return [
-        _errors(diagnosis.error, view, shown),
-        _traces(view, shown),
+        _errors(diagnosis.error, view),
+        _traces(view),
         *_where(diagnosis.where, view),
         *_ranking(diagnosis),
         *_ladder(diagnosis),
@@ -131,13 +131,12 @@ def write_comparison(
     recordings: Sequence[Recording],
 ) -> Path:
     """Write report.html of a comparison into its run directory."""
-    error, view = comparison.error, look(model, recordings)
+    error, view = comparison.error, look(model, recordings, range(len(recordings)))
     facts = [
         Fact(_percent(error.before), "error, of each signal's spread"),
         Fact(_percent(error.noise_floor), "noise floor: what noise alone would make"),
         Fact(str(len(recordings)), "recordings"),
     ]
-    everything = range(len(recordings))
     return report.write(
         run.path("report.html"),
         kind="A model against measurements",
@@ -146,8 +145,8 @@ def write_comparison(
         facts=facts,
         sections=[
             *side_by_side_section(comparison),
-            _errors(error, view, everything),
-            _traces(view, everything),
+            _errors(error, view),
+            _traces(view),
             residuals_section(
                 comparison.residuals,
                 comparison.residuals.sentence(comparison.near_noise),
@@ -165,8 +164,8 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
-def _errors(error: Errors, view: View, chosen: Sequence[int]) -> Section:
-    before, after = ([p.only(chosen) for p in played] for played in (view.before, view.after))
+def _errors(error: Errors, view: View) -> Section:
+    before, after = view.before, view.after
     stated = [
         (
             name,
@@ -183,7 +182,7 @@ def _errors(error: Errors, view: View, chosen: Sequence[int]) -> Section:
         (name, size.unit, *(s[name].rmse for s in sizes)) for name, size in sizes[0].items()
     ]
     fits = [(name, *(round(s[name].fit_percent, 1) for s in sizes)) for name in sizes[0]]
-    over = f"over {', '.join(view.recordings[i].name for i in chosen)}"
+    over = f"over {', '.join(view.recordings[i].name for i in view.shown)}"
     which = "repaired model" if view.after else "model as it is"
     return Section(
         "How far the model is off",
@@ -216,11 +215,10 @@ def _errors(error: Errors, view: View, chosen: Sequence[int]) -> Section:
     )
 
 
-def _traces(view: View, candidates: Sequence[int]) -> Section:
+def _traces(view: View) -> Section:
     before = view.before[view.middle]
     after = view.after[view.middle] if view.after else None
     order = before.worst(len(before.segments.first))
-    order = [s for s in order if before.segments.recording[s] in candidates]
     index = int(before.segments.recording[order[0]])
     recording = view.recordings[index]
     worst = [s for s in order if before.segments.recording[s] == index][:NUM_WORST]

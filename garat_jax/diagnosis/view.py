@@ -25,16 +25,20 @@ class View:
 
     Attributes:
         recordings: What was measured, those held out last.
-        before: Predictions of the model as it is, by horizon.
-        after: Predictions of the repaired model, by horizon; empty without a repair.
+        shown: Numbers of those that the report shows the predictions of.
+        before: Predictions of the model as it is, by horizon, of the recordings shown.
+        after: Predictions of the repaired model; empty without a repair.
+        whole: Those of all recordings, over the longest horizon.
         missing: The torque that the model lacks, from the measurements.
         explained: The same from the repaired model's predictions.
         host: The compiled model.
     """
 
     recordings: tuple[Recording, ...]
+    shown: Sequence[int]
     before: tuple[Replay, ...]
     after: tuple[Replay, ...]
+    whole: Replay | None
     missing: MissingTorque
     explained: MissingTorque | None
     host: mujoco.MjModel
@@ -67,35 +71,41 @@ def leftover(view: View) -> list[Place]:
     It is the torque that the measured motion lacks less the one that the repaired model's own
     predictions lack by the same computation, on the same segments.
     """
-    if view.explained is None:
+    if view.whole is None or view.explained is None:
         return localise(view.missing)
-    played = view.after[-1]
-    predicted = as_recordings(played, view.recordings, view.host)
+    predicted = as_recordings(view.whole, view.recordings, view.host)
     measured = [
         dataclasses.replace(view.recordings[i], spans=made.spans)
-        for i, made in zip(np.unique(played.segments.recording), predicted, strict=True)
+        for i, made in zip(np.unique(view.whole.segments.recording), predicted, strict=True)
     ]
     missing = missing_torque(view.host, measured)
     return localise(missing._replace(torque=missing.torque - view.explained.torque))
 
 
-def look(model: Model, recordings: Sequence[Recording], selected: Sequence[Candidate] = ()) -> View:
+def look(
+    model: Model,
+    recordings: Sequence[Recording],
+    shown: Sequence[int],
+    selected: Sequence[Candidate] = (),
+) -> View:
     """Simulate what the report shows.
 
     Args:
         model: The model as it was given.
         recordings: What was measured, those held out last.
+        shown: Numbers of the recordings that the report shows the predictions of.
         selected: The effects that a diagnosis found.
     """
     recordings = thin(recordings)
     host = native_model(model.compile(engine="mujoco"))
     longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
     horizons = [h for h in HORIZONS if h <= longest] or [longest]
-    before = replay(model, recordings, horizons)
-    after = replay(repaired(model, selected), recordings, horizons) if selected else ()
-    explained = None
-    if after:
-        as_measured = as_recordings(after[-1], recordings, host)
-        explained = missing_torque(host, as_measured)
+    before = replay(model, recordings, dict.fromkeys(horizons, shown))
+    after, whole, explained = (), None, None
+    if selected:
+        wanted = dict.fromkeys(horizons, shown) | {horizons[-1]: range(len(recordings))}
+        *after, whole = replay(repaired(model, selected), recordings, wanted)
+        after = (*after, whole.only(shown))
+        explained = missing_torque(host, as_recordings(whole, recordings, host))
     missing = missing_torque(host, recordings)
-    return View(recordings, before, after, missing, explained, host)
+    return View(recordings, shown, before, after, whole, missing, explained, host)

@@ -137,7 +137,7 @@ def test_sizes_by_hand():
 
 def test_predictions_take_the_place_of_measurements(recorded):
     model, recordings = read(recorded, "none")
-    (played,) = replay(model, recordings, [0.5])
+    (played,) = replay(model, recordings, {0.5: range(len(recordings))})
     perfect = dataclasses.replace(played, predicted=played.segments.measured)
     host = model.compile(engine="mujoco").host.model
     for made, original in zip(as_recordings(perfect, recordings, host), recordings, strict=True):

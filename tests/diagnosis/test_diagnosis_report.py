@@ -162,7 +162,7 @@ def test_what_a_repair_explains_is_not_left(tmp_path):
     recordings = [Recording.read(file, model) for file in (*made.fit, *made.holdout)]
     size = Estimate(made.parameters["torque"], 0.0, 1.0, "N m")
     found = dataclasses.replace(FRICTION, parameters={"torque": size})
-    before, after = (leftover(look(model, recordings, chosen)) for chosen in ((), (found,)))
+    before, after = (leftover(look(model, recordings, (1,), chosen)) for chosen in ((), (found,)))
     shares = [{p.regime: p.share for p in places} for places in (before, after)]
     friction = "against or with the motion"
     assert shares[0][friction] > 0.5
