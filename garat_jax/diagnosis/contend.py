@@ -24,10 +24,12 @@ class Contender:
     Attributes:
         score: What screening said.
         fit: All selected effects and this one, fitted.
+        timeless: As a timestep of 0 would have it, where that was measured.
     """
 
     score: Score
     fit: Fit
+    timeless: Fit | None = None
 
 
 def fit_contenders(

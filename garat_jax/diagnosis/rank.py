@@ -78,7 +78,7 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
     metric = make_metric(problem)
     floor = noise_floor(problem, metric, before)
     adequate = not is_above(problem, metric, before, floor)
-    current, steps, first_round, best = before, [], (), None
+    current, steps, first_round, best, added = before, [], (), None, None
     for number in range(ROUNDS):
         gap = is_above(problem, metric, current, floor)
         if number and not gap:
@@ -94,12 +94,14 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         best = contender.fit if contender is not None else best
         if candidate is None or contender is None or not candidate.passes:
             break
-        current = contender.fit
+        current, added = contender.fit, contender
         steps.append(Step(candidate, contender.score.effect, current))
         steps, current = _prune(problem, before, steps, current, say)
         floor = noise_floor(problem, metric, current)
-    if len(steps) > 1:
-        current = count_timestep(problem, current)
+    if added is not None:
+        known = added.timeless if current is added.fit else None
+        current = known or count_timestep(problem, current)
+        steps[-1] = steps[-1]._replace(fit=current)
     selected = tuple(_refreshed(problem, step, current) for step in steps)
     candidates = _without_superfluous(first_round, selected)
     best = current if steps else best
@@ -161,7 +163,7 @@ def _judge(problem, metric: Metric, current: Fit, scores, contenders: list[Conte
             judged.append(_judge_one(problem, metric, current, contenders, int(index), drawn))
         judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
         if judged[0][0].passes:
-            judged = _with_timestep(problem, judged)
+            judged = _with_timestep(problem, metric, judged)
     fitted = [c.score.effect for c in contenders]
     near = "the model's error is near the noise floor" if not gap else "others explain more"
     for score in scores:
@@ -171,15 +173,21 @@ def _judge(problem, metric: Metric, current: Fit, scores, contenders: list[Conte
     return judged
 
 
-def _with_timestep(problem: Problem, judged):
-    """Let the intervals of the first candidate, and of those like it, count the timestep."""
+def _with_timestep(problem: Problem, metric: Metric, judged):
+    """Show the first candidate, and those like it, as a timestep of 0 would have them.
+
+    Candidates are held against each other, and added to, as they fit at the model's own.
+    """
     shown = {judged[0][0].named, *judged[0][0].indistinguishable_from}
     for place, (candidate, contender) in enumerate(judged):
         if candidate.named in shown:
             fit = count_timestep(problem, contender.fit)
-            parameters = estimates(problem, contender.score.effect, fit)
-            candidate = dataclasses.replace(candidate, parameters=parameters)
-            judged[place] = (candidate, dataclasses.replace(contender, fit=fit))
+            candidate = dataclasses.replace(
+                candidate,
+                parameters=estimates(problem, contender.score.effect, fit),
+                error_after=metric.error(fit.residual, ~problem.fitted),
+            )
+            judged[place] = (candidate, dataclasses.replace(contender, timeless=fit))
     return judged
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy import signal
 
 from garat_jax.diagnosis.diagnose import make_candidates, split, thin
-from garat_jax.diagnosis.fit import fit, settle
+from garat_jax.diagnosis.fit import count_timestep, fit, settle
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
@@ -22,10 +22,11 @@ from tests import models
 MODEL = Model("pendulum", __file__, __file__, models.spec(models.PENDULUM))
 
 
-def record(time, damping=0.0, delay=0, noise=1e-3, seed=0, command=1.0) -> Recording:
-    """Step C MuJoCo at the model's own timestep, each interval in 2 substeps or more."""
+def record(time, damping=0.0, delay=0, noise=1e-3, seed=0, command=1.0, finer=1) -> Recording:
+    """Step C MuJoCo at the model's own timestep or a finer one, each interval in some substeps."""
     rng = np.random.default_rng(seed)
     model = models.spec(models.PENDULUM).compile()
+    model.opt.timestep /= finer
     model.dof_damping[0] += damping
     data = mujoco.MjData(model)
     data.qpos[0] = 0.8
@@ -99,6 +100,17 @@ def test_a_fit_recovers_a_parameter_and_its_interval_covers_it():
     assert found.theta[free[0]] == pytest.approx(0.02, rel=0.02)
     assert found.low[0] < 0.02 < found.high[0]
     assert np.sqrt(np.mean(found.residual**2)) == pytest.approx(1.0, abs=0.25)
+
+
+def test_estimates_are_what_a_timestep_of_zero_would_give():
+    problem = make_problem([record(UNIFORM, damping=0.02, noise=1e-5, finer=32)], candidates())
+    free = [column(problem.simulator, "viscous_damping")]
+    found = fit(problem, problem.simulator.base, problem.segments.start, free)
+    timeless = count_timestep(problem, found)
+    assert timeless.low[0] < 0.02 < timeless.high[0]
+    assert timeless.low[0] < timeless.theta[free[0]] < timeless.high[0]
+    assert abs(timeless.theta[free[0]] - 0.02) < 0.2 * abs(found.theta[free[0]] - 0.02)
+    assert timeless.high[0] - timeless.low[0] < 0.5 * (found.high[0] - found.low[0])
 
 
 def test_settled_initial_states_leave_only_noise():
