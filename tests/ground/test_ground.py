@@ -143,7 +143,8 @@ def test_a_transform_acts_before_the_model_as_its_equal_effect(read, recorded):
     effect = CATALOGUE["torque_offset"](target="joint/hinge", torque=torque)
     shifted = dataclasses.replace(model, transform=lambda state, command: command + torque)
     by_effect = dataclasses.replace(model, effects=(effect,))
-    (one,), (other,) = (replay(m, recordings, [0.5]) for m in (shifted, by_effect))
+    horizons = {0.5: range(len(recordings))}
+    (one,), (other,) = (replay(m, recordings, horizons) for m in (shifted, by_effect))
     np.testing.assert_allclose(one.predicted, other.predicted, atol=1e-5)
     found = compare(model, recordings, also=[shifted])
     assert found.also[0].error < 0.5 * found.error.before
