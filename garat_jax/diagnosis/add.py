@@ -118,7 +118,7 @@ def size(
     say(f"fitting {effect.kind} at {effect.target}")
     best = _best_fit(problem, before, effect, given, free)
     return Sized(
-        effect=simulator.with_parameters([float(v) for v in best.theta])[0],
+        effect=simulator.with_parameters([float(v) for v in best.theta], [0])[0],
         parameters=estimates(problem, best),
         horizon=horizon,
         error_before=metric.error(before.residual, problem.fitted),

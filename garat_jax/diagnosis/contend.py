@@ -1,10 +1,15 @@
-"""Fit the candidates that screening puts first, so that they can be held against each other."""
+"""Fit the candidates that screening puts first, so that they can be held against each other.
+
+A candidate that was fitted is tested anew, by what its fit changes in all the segments that are
+fitted: screening looks at some of them, at a size that is only realistic.
+"""
 
 import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.fit import Fit, fit
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, simpler_law
@@ -22,7 +27,7 @@ class Contender:
     """A candidate that was fitted.
 
     Attributes:
-        score: What screening said.
+        score: What screening said, with the fit's p-value once it was tested.
         fit: All selected effects and this one, fitted.
         timeless: As a timestep of 0 would have it, where that was measured.
     """
@@ -70,8 +75,7 @@ def fit_refinements(
 ) -> list[Contender]:
     """Fit the laws that refine the best contender's at its place and that screening may not see.
 
-    That something acts there is the simpler law's evidence, which they take over. A law that acted
-    before it was fitted is left as it is.
+    A law that acted before it was fitted is left as it is.
     """
     effects = problem.simulator.effects
     simple = effects[best.score.effect]
@@ -79,21 +83,20 @@ def fit_refinements(
     own = columns_of(problem.simulator.slots, best.score.effect)
     if any(current.theta[j] != none[name] for name, j in own.items()):
         return []
-    values = problem.simulator.with_parameters([float(v) for v in best.fit.theta])
+    theta = [float(value) for value in best.fit.theta]
+    (found,) = problem.simulator.with_parameters(theta, [best.score.effect])
     rival = best.fit.cost[problem.fitted].sum()
     contenders = []
     for score in scores:
         law = effects[score.effect]
         if law.target != simple.target or simple.kind not in law.refines:
             continue
-        alike = type(law).refined_from(values[best.score.effect])
+        alike = type(law).refined_from(found)
         if not alike:
             continue
         columns = columns_of(problem.simulator.slots, score.effect)
         start = {columns[name]: value for name, value in alike.items()}
-        score = dataclasses.replace(
-            score, columns=tuple(columns.values()), start=start, p_value=best.score.p_value
-        )
+        score = dataclasses.replace(score, columns=tuple(columns.values()), start=start)
         contenders.append(_fit(problem, current, score, rival, say))
     return contenders
 
@@ -114,6 +117,33 @@ def fit_further(problem: Problem, best: Contender, say: Callable[[str], None]) -
     fitted = fit(problem, best.fit.theta, start, free, sensitivity=sensitivity)
     score = dataclasses.replace(best.score, columns=(*best.score.columns, *further))
     return [Contender(score, fitted)]
+
+
+def with_evidence(
+    problem: Problem, current: Fit, contenders: Sequence[Contender], num_tests: int
+) -> list[Contender]:
+    """Give contenders the p-values of what their fits change, with Bonferroni's correction.
+
+    Args:
+        problem: The recordings and the model with every candidate.
+        current: The fit of the effects selected so far.
+        contenders: The candidates that were fitted.
+        num_tests: How many candidates were scored.
+    """
+    if not contenders:
+        return []
+    chosen = np.flatnonzero(problem.fitted)
+    evidence = Evidence(problem.take(chosen), current, current.start[chosen])
+    changes = evidence.rest(
+        np.stack([(c.fit.residual - current.residual)[chosen] for c in contenders])
+    )
+    tested = []
+    for change, contender in zip(changes.T, contenders, strict=True):
+        score = contender.score
+        p_value = evidence.p_value(score.effect, change[:, None], len(score.columns))
+        score = dataclasses.replace(score, p_value=min(1.0, num_tests * p_value))
+        tested.append(dataclasses.replace(contender, score=score))
+    return tested
 
 
 def _fit(problem: Problem, current: Fit, score: Score, rival: float, say) -> Contender:

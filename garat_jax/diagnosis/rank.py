@@ -11,7 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, fit_contenders, fit_further, fit_refinements
+from garat_jax.diagnosis.contend import (
+    Contender,
+    fit_contenders,
+    fit_further,
+    fit_refinements,
+    with_evidence,
+)
 from garat_jax.diagnosis.fit import Fit, count_timestep, fit, settle
 from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor
 from garat_jax.diagnosis.problem import Problem, block_labels
@@ -88,6 +94,8 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         scores = screen(problem, current, held)
         contenders = fit_contenders(problem, current, scores, say) if gap else []
         contenders = _refine(problem, metric, current, scores, contenders, floor, say)
+        num_tests = sum(not score.excluded for score in scores)
+        contenders = with_evidence(problem, current, contenders, num_tests)
         judged = _judge(problem, metric, current, scores, contenders, gap)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         candidate, contender = judged[0] if judged else (None, None)

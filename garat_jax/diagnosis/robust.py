@@ -50,17 +50,25 @@ def regress(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray) -> Re
 
 
 def wald_test(
-    matrix: np.ndarray, residual: np.ndarray, nuisance: np.ndarray, labels: np.ndarray
+    matrix: np.ndarray,
+    residual: np.ndarray,
+    nuisance: np.ndarray,
+    labels: np.ndarray,
+    num_fitted: int | None = None,
 ) -> float:
     """Return the p-value of a robust test that all of the columns' coefficients are 0.
+
+    One column that was fitted with several parameters is tested as that many: the statistic of the
+    combination that explains most is that of all of them together (Scheffé 1953).
 
     Args:
         matrix: Columns, [M, k].
         residual: [M].
         nuisance: Orthonormal columns that are projected out first, [M, n].
         labels: The block of each residual, integers, [M].
+        num_fitted: Number of parameters that were fitted to find the columns; k if not given.
     """
-    unit = np.linalg.norm(matrix, axis=0)
+    unit = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     matrix, residual = (
         without(matrix / unit, nuisance),
         residual - nuisance @ (nuisance.T @ residual),
@@ -70,10 +78,11 @@ def wald_test(
     if matrix.shape[1] == 0:
         return 1.0
     found = regress(matrix, residual, labels)
-    num = matrix.shape[1]
+    num = num_fitted or matrix.shape[1]
     precision = np.linalg.pinv(found.covariance, hermitian=True)
     statistic = float(found.coefficient @ precision @ found.coefficient) / num
-    return float(stats.f.sf(statistic, num, found.freedom))
+    freedom = max(found.freedom + matrix.shape[1] - num, 1)
+    return float(stats.f.sf(statistic, num, freedom))
 
 
 def orthonormal(columns: np.ndarray) -> np.ndarray:

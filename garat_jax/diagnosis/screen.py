@@ -2,29 +2,19 @@
 
 A candidate's sensitivity is the change of the predictions at a realistic size of its parameters; a
 law with a threshold, which does nothing below it, is tried at several (`Effect.starts`; see
-`trials`). What
-initial states and parameters already free can explain is projected out. Evidence is a Wald test of
-what is left after common delay, sensor offsets and the integrator's error too, with blocks of time
-as the independent units (Liang and Zeger 1986) and Holm's correction (1979).
+`trials`). What initial states and parameters already free can explain is projected out. P-values
+(`evidence`) have Holm's correction (1979).
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
+from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.fit import Fit
-from garat_jax.diagnosis.problem import (
-    Linearisation,
-    Problem,
-    StartSpace,
-    block_labels,
-    difference_steps,
-    linearise,
-    tall,
-)
-from garat_jax.diagnosis.robust import orthonormal, wald_test, without
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.robust import orthonormal, without
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.trials import Row, Trial, best_sizes, enlarge, firsts, others
 
@@ -38,13 +28,6 @@ VISIBLE = 3.0
 """Whitened change over a parameter's whole range below which the data cannot show it."""
 WORTHWHILE = 0.01
 """Share of the residual that a further parameter of the same effect must explain."""
-DELAYS = ("actuator_delay", "sensor_delay")
-"""Kinds that a common delay stands for: it is no nuisance to them."""
-OFFSETS = (
-    "torque_offset", "gravity_scale", "gravity_tilt", "payload_mass", "com_offset",
-    "joint_stiffness", "encoder_offset",
-)  # fmt: skip
-"""Kinds whose static part an offset of a position sensor imitates: it is no nuisance to them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,26 +57,6 @@ class Score:
     excluded: str = ""
 
 
-class _Sensitivities(NamedTuple):
-    """What the fitted data say once initial states and free parameters are removed.
-
-    Attributes:
-        residual: [M].
-        changes: Of each row, [M, rows].
-        delay: Columns of a common delay, [M, 0 or 1].
-        offsets: Of an offset of each position sensor, [M, nq].
-        integrator: Of the integrator's error, [M, 1].
-        labels: Block of each residual, [M].
-    """
-
-    residual: np.ndarray
-    changes: np.ndarray
-    delay: np.ndarray
-    offsets: np.ndarray
-    integrator: np.ndarray
-    labels: np.ndarray
-
-
 def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> list[Score]:
     """Score all candidates that are not in the model yet, largest share first.
 
@@ -104,9 +67,10 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
     """
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SCREENED)]
-    problem, start = problem.take(chosen), fit.start[chosen]
-    rows, trials, sensitivities = _measure(problem, fit, start, skip)
-    raw = [_score(problem, sensitivities, rows, trial) for trial in trials]
+    problem = problem.take(chosen)
+    evidence = Evidence(problem, fit, fit.start[chosen])
+    rows, trials, changes = _measure(problem, fit.theta, evidence, skip)
+    raw = [_score(problem, evidence, changes, rows, trial) for trial in trials]
     judged = [score for score in raw if not score.excluded]
     order = np.argsort([score.p_value for score in judged])
     adjusted, largest = {}, 0.0
@@ -142,76 +106,40 @@ def cosine(a: Score, b: Score) -> float:
     return float(abs(a.contribution @ b.contribution) / size) if size > 0 else 0.0
 
 
-def _measure(problem: Problem[Simulator], fit: Fit, start, skip):
+def _measure(problem: Problem[Simulator], theta: np.ndarray, evidence: Evidence, skip):
     """Simulate the candidates at all their sizes, then the other parameters of the best size.
 
     Returns:
-        Rows, a trial for each candidate, and the sensitivities.
+        Rows, a trial for each candidate, and what the rows change, [M, rows].
     """
-    simulator, segments = problem.simulator, problem.segments
-    steps = difference_steps(problem, fit.theta, fit.free, 1e-2)
-    lin = linearise(problem, fit.theta, start, fit.free, steps)
-    remove = _Remover(lin)
+    simulator, residual = problem.simulator, evidence.residual
 
     def change(rows: list[Row]) -> np.ndarray:
-        thetas = np.tile(fit.theta, (len(rows), 1))
-        for theta, row in zip(thetas, rows, strict=True):
-            theta[list(row.values)] = list(row.values.values())
-        moved = simulator.linear_change(thetas, fit.theta, start, segments)
-        return remove(problem.whiten_change(moved))
+        thetas = np.tile(theta, (len(rows), 1))
+        for moved, row in zip(thetas, rows, strict=True):
+            moved[list(row.values)] = list(row.values.values())
+        return evidence.change(thetas)
 
-    residual = remove(lin.residual[None])[:, 0]
-    rows, trials = firsts(simulator, fit.theta, skip)
+    rows, trials = firsts(simulator, theta, skip)
     changes = change(rows)
     rows, trials, larger = enlarge(simulator, rows, trials, changes, residual)
     if larger:
         changes[:, larger] = change([rows[i] for i in larger])
     num_firsts = len(rows)
-    rows, trials = others(simulator, fit.theta, rows, best_sizes(trials, changes, residual))
+    rows, trials = others(simulator, theta, rows, best_sizes(trials, changes, residual))
     if more := rows[num_firsts:]:
         below = [changes[:, row.below] if row.below >= 0 else 0.0 * residual for row in more]
         changes = np.concatenate([changes, change(more) - np.stack(below, axis=1)], axis=1)
-    integrator = problem.integrator_error(fit.theta, start, lin.residual)
-    nuisances = remove(np.stack([integrator, *_offsets(problem)]))
-    delays = [t for t in trials if simulator.effects[t.effect].kind in DELAYS]
-    common = [t for t in delays if simulator.effects[t.effect].target == "all"] or delays[:1]
-    sensitivities = _Sensitivities(
-        residual=residual,
-        changes=changes,
-        delay=changes[:, [t.rows[0] for t in common[:1]]],
-        offsets=nuisances[:, 1:],
-        integrator=nuisances[:, :1],
-        labels=block_labels(problem).ravel(),
-    )
-    return rows, trials, sensitivities
+    return rows, trials, changes
 
 
-def _offsets(problem: Problem) -> np.ndarray:
-    """Return a constant error of each position sensor, whitened, [nq, S, N]."""
-    segments = problem.segments
-    num_position = problem.simulator.host.nq
-    unit = np.eye(segments.measured.shape[2])[:num_position] / segments.noise
-    offset = (segments.weight * segments.trust)[None, :, :, None] * unit[:, None, None, :]
-    return offset.reshape(num_position, *segments.weight.shape[:1], -1)
-
-
-class _Remover:
-    """Removes what initial states and free parameters explain from columns [k, S, N]."""
-
-    def __init__(self, lin: Linearisation):
-        self._space = StartSpace(lin.start)
-        self._free = orthonormal(tall(self._space.remove(lin.parameters)))
-
-    def __call__(self, columns: np.ndarray) -> np.ndarray:
-        rest = self._space.remove(np.moveaxis(columns, 0, -1))
-        return without(tall(rest), self._free)
-
-
-def _score(problem: Problem, s: _Sensitivities, rows: list[Row], trial: Trial) -> Score:
+def _score(
+    problem: Problem, evidence: Evidence, changes: np.ndarray, rows: list[Row], trial: Trial
+) -> Score:
     """Judge one candidate at one size."""
-    chosen = list(trial.rows)
+    chosen, residual = list(trial.rows), evidence.residual
     slots = [problem.simulator.slots[rows[i].column].parameter for i in chosen]
-    matrix = s.changes[:, chosen]
+    matrix = changes[:, chosen]
     norm = np.linalg.norm(matrix, axis=0)
     steps = np.abs([rows[i].step for i in chosen])
     width = np.asarray([p.high - p.low for p in slots])
@@ -223,18 +151,14 @@ def _score(problem: Problem, s: _Sensitivities, rows: list[Row], trial: Trial) -
         reason = f"the recordings do not excite it: its {unseen[0]} changes no signal"
         columns = tuple(rows[i].column for i in chosen)
         return Score(trial.effect, columns, (), {}, 0.0, 1.0, False, matrix[:, 0], reason)
-    needed = _needed(matrix, s.residual, seen, given)
+    needed = _needed(matrix, residual, seen, given)
     chosen, matrix = [chosen[i] for i in needed], matrix[:, needed]
-    factor = np.linalg.lstsq(matrix, -s.residual, rcond=1e-6)[0]
+    factor = np.linalg.lstsq(matrix, -residual, rcond=1e-6)[0]
     contribution = matrix @ factor
-    total = float(s.residual @ s.residual)
-    share = 1.0 - float(np.sum((s.residual + contribution) ** 2)) / total if total > 0 else 0.0
+    total = float(residual @ residual)
+    share = 1.0 - float(np.sum((residual + contribution) ** 2)) / total if total > 0 else 0.0
     size, start, possible = _size(problem.simulator, rows, trial, chosen, factor)
-    kind = problem.simulator.effects[trial.effect].kind
-    nuisances = [s.integrator]
-    nuisances += [] if kind in DELAYS else [s.delay]
-    nuisances += [] if kind in OFFSETS else [s.offsets]
-    p_value = wald_test(matrix, s.residual, orthonormal(np.concatenate(nuisances, 1)), s.labels)
+    p_value = evidence.p_value(trial.effect, matrix)
     columns = tuple(rows[i].column for i in chosen)
     return Score(trial.effect, columns, size, start, share, p_value, possible, contribution)
 

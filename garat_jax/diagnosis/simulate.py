@@ -79,7 +79,7 @@ class Simulator:
         refine: int = 1,
         acting: Sequence[int] = (),
     ):
-        """Compile the model with every candidate.
+        """Compile the model; with candidates it is compiled when they first act together.
 
         Args:
             model: The model under diagnosis.
@@ -89,37 +89,45 @@ class Simulator:
             acting: Indices of candidates that are not at their nominal, and act as they are.
         """
         timestep = Override("option", "", "timestep", grid.timestep / refine)
-        model = dataclasses.replace(model, overrides=(*model.overrides, timestep))
-        with jax.enable_x64(True):
-            self._world = model.compile(extra_effects=tuple(candidates))
-        own = self._world.effects[: len(self._world.effects) - len(candidates)]
-        self._own = tuple(effect.as_replayed() for effect in own)
-        self._substeps = grid.substeps * refine
-        self._warm_up = warm_up_steps(grid, self._world.host.model.nu)
-        self._on_grid = grid.uniform
+        self._model = dataclasses.replace(model, overrides=(*model.overrides, timestep))
         self.effects = tuple(candidates)
+        self._alone = self._compile(())
+        self._substeps = grid.substeps * refine
+        self._warm_up = warm_up_steps(grid, self.host.nu)
+        self._on_grid = grid.uniform
         self.slots = tuple(
             Slot(i, p, float(getattr(effect, p.name)))
             for i, effect in enumerate(candidates)
             for p in effect.parameters()
         )
         self.base = np.asarray([slot.base for slot in self.slots])
+        self._columns = [columns_of(self.slots, i) for i in range(len(candidates))]
         self._owner = np.asarray([slot.effect for slot in self.slots], int)
         self._always = {*acting}
         replayed = [effect.as_replayed() for effect in candidates]
         looking = [i for i, e in enumerate(replayed) if e.reads_state or e.notes]
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
         self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
-        self._compiler_options = dict(UNOPTIMISED) if self._world.engine == "mujoco" else {}
+        self._compiler_options = dict(UNOPTIMISED) if self._alone.engine == "mujoco" else {}
         self._transform = model.transform
-        own_alone = self._world.replace(effects=self._own)
-        self._any_at_once = dynamics.steps_at_once(own_alone) and model.transform is None
+        self._any_at_once = dynamics.steps_at_once(self._alone) and model.transform is None
         self._programs: dict[tuple[str, tuple[int, ...]], Program] = {}
 
     @property
     def host(self):
-        """The compiled MuJoCo model."""
-        return self._world.host.model
+        """The compiled MuJoCo model, without candidates."""
+        return self._alone.host.model
+
+    def _compile(self, chosen: tuple[int, ...]) -> dynamics.Dynamics:
+        """Return the model's own effects on the model as it is compiled for some candidates.
+
+        What a candidate needs of the model, a friction's row or a payload's body, costs time in
+        every step, whether it acts or not.
+        """
+        with jax.enable_x64(True):
+            world = self._model.compile(extra_effects=[self.effects[i] for i in chosen])
+        own = world.effects[: len(world.effects) - len(chosen)]
+        return world.replace(effects=tuple(effect.as_replayed() for effect in own))
 
     def _is_memoryless(self, effect: Effect) -> bool:
         return not effect.notes and not jax.tree.leaves(effect.init(self.host))
@@ -162,19 +170,17 @@ class Simulator:
         """
         result = np.empty((len(theta), *segments.measured.shape))
         program = self._program(self._acting(base[None]))
-        now, path = self._in_batches(program, segments, base[None], start[None])
+        _, path = self._in_batches(program, segments, base[None], start[None])
         for (way, _), rows in self._ways(theta, base).items():
-            moved, starts = theta[rows], np.broadcast_to(start, (len(rows) + 1, *start.shape))
-            if way == "stepped":
-                result[rows] = self.predict(moved, starts[1:], segments) - now
-            elif way == "at once":
-                run = self._program(self._blind)
-                result[rows] = self._in_batches(run, segments, moved, starts[1:])[0] - now
+            both = np.concatenate([base[None], theta[rows]])
+            starts = np.broadcast_to(start, (len(both), *start.shape))
+            acting, along = self._acting(both), None
+            if way == "along":
+                run, along = self._along(acting), path[0]
             else:
-                both = np.concatenate([base[None], moved])
-                run = self._along(self._acting(both))
-                changed = self._in_batches(run, segments, both, starts, path[0])[0]
-                result[rows] = changed[1:] - changed[0]
+                run = self._program(self._blind if way == "at once" else acting)
+            changed = self._in_batches(run, segments, both, starts, along)[0]
+            result[rows] = changed[1:] - changed[0]
         return result
 
     def _ways(self, theta: np.ndarray, base: np.ndarray) -> dict[tuple[str, str], list[int]]:
@@ -214,7 +220,7 @@ class Simulator:
 
     def _jitted(self, way: str, chosen: tuple[int, ...], function) -> Program:
         if (way, chosen) not in self._programs:
-            one = functools.partial(function, chosen)
+            one = functools.partial(function, self._compile(chosen), chosen)
             run = jax.jit(jax.vmap(one), compiler_options=self._compiler_options)
             self._programs[way, chosen] = Program(run, way == "stepped")
         return self._programs[way, chosen]
@@ -245,31 +251,30 @@ class Simulator:
             for parts in (found, paths)
         )
 
-    def with_parameters(self, theta) -> tuple[Effect, ...]:
-        """Return the candidate effects with the values of `theta`, [num_parameters]."""
-        values: list[dict] = [{} for _ in self.effects]
-        for j, slot in enumerate(self.slots):
-            values[slot.effect][slot.parameter.name] = theta[j]
-        return tuple(e.replace(**v) for e, v in zip(self.effects, values, strict=True))
+    def with_parameters(self, theta, chosen: Sequence[int]) -> tuple[Effect, ...]:
+        """Return some of the candidates with the values of `theta`, [num_parameters]."""
+        return tuple(
+            self.effects[i].replace(**{n: theta[j] for n, j in self._columns[i].items()})
+            for i in chosen
+        )
 
-    def _world_with(self, theta, chosen: Sequence[int]) -> dynamics.Dynamics:
-        """Return the model with some of the candidates, at the values of `theta`."""
-        candidates = self.with_parameters(theta)
-        acting = (candidates[i].as_replayed() for i in chosen)
-        return self._world.replace(effects=(*self._own, *acting))
+    def _with(self, world: dynamics.Dynamics, chosen: Sequence[int], theta) -> dynamics.Dynamics:
+        """Return a world with some of the candidates, at the values of `theta`."""
+        acting = (effect.as_replayed() for effect in self.with_parameters(theta, chosen))
+        return world.replace(effects=(*world.effects, *acting))
 
     def _begin(self, world: dynamics.Dynamics, start):
         num_position = self.host.nq
         return dynamics.initial_state(world, start[:num_position], start[num_position:])
 
-    def _predict_at_once(self, chosen: tuple[int, ...], theta, start, ctrl, place):
+    def _predict_at_once(self, world, chosen: tuple[int, ...], theta, start, ctrl, place):
         """Predict one segment with candidates that do not look at the state."""
-        world = self._world_with(theta, chosen)
+        world = self._with(world, chosen, theta)
         return self._trace(world, start, ctrl, place, None)
 
-    def _predict_along(self, chosen: tuple[int, ...], theta, start, ctrl, place, path):
+    def _predict_along(self, world, chosen: tuple[int, ...], theta, start, ctrl, place, path):
         """Predict one segment with candidates that look at a path [T + 1, nq + nv] instead."""
-        world = self._world_with(theta, chosen)
+        world = self._with(world, chosen, theta)
         between = (path[:-1] + path[1:]) / 2
         before = jnp.broadcast_to(path[0], (self._warm_up, *path.shape[1:]))
         return self._trace(world, start, ctrl, place, jnp.concatenate([before, between]))
@@ -282,12 +287,12 @@ class Simulator:
         signals, true = (jnp.concatenate([s.qpos, s.qvel], axis=1) for s in (sensed, states))
         return self._at_samples(signals, place), true
 
-    def _predict(self, chosen: tuple[int, ...], theta, start, ctrl, place):
+    def _predict(self, world, chosen: tuple[int, ...], theta, start, ctrl, place):
         """Predict one segment step by step: what the sensors report, and the path on the grid.
 
         During the warm-up the mechanism is held at its start.
         """
-        world = self._world_with(theta, chosen)
+        world = self._with(world, chosen, theta)
         state = self._begin(world, start)
 
         def whole(state):

@@ -1,0 +1,107 @@
+"""Test whether the residual holds an effect that nothing else in the recordings imitates.
+
+Initial states and parameters already free are projected out of everything. The test is a robust
+Wald test of what is left beside a common delay, offsets of the sensors and the integrator's error,
+with blocks of time as the independent units (Liang and Zeger 1986).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from garat_jax.diagnosis.fit import Fit
+from garat_jax.diagnosis.problem import (
+    Problem,
+    StartSpace,
+    block_labels,
+    difference_steps,
+    linearise,
+    tall,
+)
+from garat_jax.diagnosis.robust import orthonormal, wald_test, without
+from garat_jax.diagnosis.simulate import Simulator, columns_of
+
+DELAYS = ("actuator_delay", "sensor_delay")
+"""Kinds that a common delay stands for: it is no nuisance to them."""
+OFFSETS = (
+    "torque_offset", "gravity_scale", "gravity_tilt", "payload_mass", "com_offset",
+    "joint_stiffness", "encoder_offset",
+)  # fmt: skip
+"""Kinds whose static part an offset of a position sensor imitates: it is no nuisance to them."""
+
+
+class Evidence:
+    """What some segments say beyond their initial states and the parameters already free.
+
+    Args:
+        problem: What is fitted, of these segments only.
+        fit: The current fit.
+        start: Its initial states of these segments, [S, nq + nv].
+
+    Attributes:
+        residual: [M].
+    """
+
+    def __init__(self, problem: Problem[Simulator], fit: Fit, start: np.ndarray):
+        self._problem, self._theta, self._start = problem, fit.theta, start
+        steps = difference_steps(problem, fit.theta, fit.free, 1e-2)
+        lin = linearise(problem, fit.theta, start, fit.free, steps)
+        self._space = StartSpace(lin.start)
+        self._free = orthonormal(tall(self._space.remove(lin.parameters)))
+        self._labels = block_labels(problem).ravel()
+        self.residual = self.rest(lin.residual[None])[:, 0]
+        integrator = problem.integrator_error(fit.theta, start, lin.residual)
+        nuisances = self.rest(np.stack([integrator, *_offsets(problem)]))
+        self._integrator, self._offsets = nuisances[:, :1], nuisances[:, 1:]
+        self._delay = self._common_delay(fit.free)
+
+    def change(self, thetas: np.ndarray) -> np.ndarray:
+        """Return what parameters [k, num_parameters] change in the predictions, [M, k]."""
+        simulator, segments = self._problem.simulator, self._problem.segments
+        moved = simulator.linear_change(thetas, self._theta, self._start, segments)
+        return self.rest(self._problem.whiten_change(moved))
+
+    def p_value(self, effect: int, matrix: np.ndarray, num: int | None = None) -> float:
+        """Return the probability of such evidence without the effect.
+
+        Args:
+            effect: Index among the simulator's effects.
+            matrix: What it changes, [M, k].
+            num: Number of parameters that were fitted to find the columns; k if not given.
+        """
+        kind = self._problem.simulator.effects[effect].kind
+        nuisances = [self._integrator]
+        nuisances += [] if kind in DELAYS else [self._delay]
+        nuisances += [] if kind in OFFSETS else [self._offsets]
+        nuisance = orthonormal(np.concatenate(nuisances, axis=1))
+        return wald_test(matrix, self.residual, nuisance, self._labels, num)
+
+    def rest(self, columns: np.ndarray) -> np.ndarray:
+        """Return changes [k, S, N] less what initial states and free parameters do, [M, k]."""
+        rest = self._space.remove(np.moveaxis(columns, 0, -1))
+        return without(tall(rest), self._free)
+
+    def _common_delay(self, free: Sequence[int]) -> np.ndarray:
+        """Return what a delay changes, [M, 1]; [M, 0] if none is a candidate or one is free."""
+        simulator = self._problem.simulator
+        held = [
+            (effect.target != "all", *columns_of(simulator.slots, index).values())
+            for index, effect in enumerate(simulator.effects)
+            if effect.kind in DELAYS
+        ]
+        held = sorted(columns for columns in held if not {*columns[1:]} & {*free})
+        if not held:
+            return np.zeros((len(self.residual), 0))
+        moved = self._theta.copy()
+        column = held[0][1]
+        moved[column] += simulator.slots[column].parameter.scale
+        return self.change(moved[None])
+
+
+def _offsets(problem: Problem) -> np.ndarray:
+    """Return a constant error of each position sensor, whitened, [nq, S, N]."""
+    segments = problem.segments
+    num_position = problem.simulator.host.nq
+    unit = np.eye(segments.measured.shape[2])[:num_position] / segments.noise
+    offset = (segments.weight * segments.trust)[None, :, :, None] * unit[:, None, None, :]
+    return offset.reshape(num_position, *segments.weight.shape[:1], -1)

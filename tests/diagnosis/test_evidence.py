@@ -1,0 +1,66 @@
+"""A fit is evidence for its effect only beyond chance and beyond what a delay imitates."""
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.contend import Contender, with_evidence
+from garat_jax.diagnosis.evidence import Evidence
+from garat_jax.diagnosis.fit import fit, settle
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.robust import wald_test
+from garat_jax.diagnosis.screen import Score
+from garat_jax.effects import ActuatorDelay, ViscousDamping
+from tests.diagnosis.test_fit import make_problem, record
+
+TIME = np.arange(500) * 0.004
+NO_NUISANCE = np.zeros((400, 0))
+BLOCKS = np.repeat(np.arange(40), 10)
+
+
+def evidence_for_damping(problem: Problem) -> float:
+    """Fit damping, the first candidate, and return its p-value."""
+    before = settle(problem, problem.simulator.base, problem.segments.start)
+    after = fit(problem, before.theta, before.start, (0,))
+    score = Score(0, (0,), (), {}, 0.0, 1.0, True, np.zeros(0))
+    (tested,) = with_evidence(problem, before, [Contender(score, after)], num_tests=1)
+    return tested.score.p_value
+
+
+def test_damping_is_significant_where_it_is_there():
+    problem = make_problem([record(TIME, damping=0.02)], (ViscousDamping("joint/hinge"),))
+    assert evidence_for_damping(problem) < 1e-6
+
+
+def test_damping_is_not_significant_where_it_is_not_there():
+    damping = (ViscousDamping("joint/hinge"),)
+    found = [
+        evidence_for_damping(make_problem([record(TIME, seed=seed)], damping)) for seed in range(8)
+    ]
+    assert np.median(found) > 0.1
+    assert min(found) > 0.01
+
+
+def test_what_a_delay_imitates_is_no_evidence_where_a_delay_is_possible():
+    damping, delay = ViscousDamping("joint/hinge"), ActuatorDelay("all")
+    problem = make_problem([record(TIME, delay=4)], (damping, delay))
+    before = settle(problem, problem.simulator.base, problem.segments.start)
+    evidence = Evidence(problem, before, before.start)
+    delayed = evidence.change(np.array([[0.0, 0.005]]))
+    is_damping, is_delay = 0, 1
+    assert evidence.p_value(is_delay, delayed) < 1e-6
+    assert evidence.p_value(is_damping, delayed) > 0.01
+
+
+def test_a_fit_that_changes_nothing_is_no_evidence():
+    assert wald_test(np.zeros((400, 1)), np.ones(400), NO_NUISANCE, BLOCKS) == 1.0
+
+
+@pytest.mark.parametrize(("num_fitted", "low", "high"), [(None, 0.3, 1.0), (4, 0.0, 0.1)])
+def test_a_combination_that_was_fitted_is_tested_as_all_its_parameters(num_fitted, low, high):
+    rng = np.random.default_rng(0)
+    false = 0
+    for _ in range(200):
+        columns, residual = rng.normal(size=(400, 4)), rng.normal(size=400)
+        best = columns @ np.linalg.lstsq(columns, residual, rcond=None)[0]
+        false += wald_test(best[:, None], residual, NO_NUISANCE, BLOCKS, num_fitted) < 0.05
+    assert low < false / 200 < high
