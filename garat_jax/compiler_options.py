@@ -12,27 +12,33 @@ from garat_jax.dynamics import Dynamics
 DEEP_CHAIN = 5
 """Joints in a chain from which XLA's CPU fusion emitters slow MJX down; see docs/performance.md."""
 FUSION_EMITTERS = "xla_cpu_use_fusion_emitters"
+OPTIMISATION_LEVEL = "xla_backend_optimization_level"
 
 
 def compiler_options(dynamics: Dynamics) -> dict[str, Any]:
     """Return XLA's options for programs that step these dynamics.
 
     XLA's CPU fusion emitters make MJX up to hundreds of times slower on deep kinematic chains
-    (github.com/jax-ml/jax/issues/33761) and shallow ones slightly faster. C MuJoCo is not touched
-    by them. What the user put in XLA_FLAGS stays as it is.
+    (github.com/jax-ml/jax/issues/33761) and shallow ones slightly faster. Around C MuJoCo, which is
+    not touched by them, LLVM's higher levels of optimisation cost half of the compile time and save
+    nothing; see docs/performance.md. What the user put in XLA_FLAGS stays as it is.
     """
-    if dynamics.engine != "mjx" or jax.default_backend() != "cpu":
+    if jax.default_backend() != "cpu":
         return {}
-    if chain_depth(dynamics) < DEEP_CHAIN or FUSION_EMITTERS in os.environ.get("XLA_FLAGS", ""):
-        return {}
-    return {FUSION_EMITTERS: False} if is_known_option(FUSION_EMITTERS) else {}
+    options: dict[str, Any] = {}
+    if dynamics.engine == "mujoco":
+        options = {OPTIMISATION_LEVEL: 1}
+    elif chain_depth(dynamics) >= DEEP_CHAIN:
+        options = {FUSION_EMITTERS: False}
+    flags = os.environ.get("XLA_FLAGS", "")
+    return {k: v for k, v in options.items() if k not in flags and is_known_option(k, v)}
 
 
 @functools.cache
-def is_known_option(name: str) -> bool:
+def is_known_option(name: str, value: bool | int = False) -> bool:
     """Say whether the installed XLA takes a compiler option; it refuses those it does not know."""
     try:
-        jax.jit(lambda x: x + 1, compiler_options={name: False}).lower(0.0).compile()
+        jax.jit(lambda x: x + 1, compiler_options={name: value}).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True

@@ -77,6 +77,7 @@ class TransferConfig:
     num_updates: int = 50  # of the action transformer, Desai et al. 2020
     num_retraining: int = 60  # iterations of the agent in the grounded source
     num_target_transitions: int = 5000
+    num_curve_transitions: int = 1000  # for the error after each update, and the best constant
     action_noise: float = 0.135  # half-ranges: the transformer's initial standard deviation
     num_episodes: int = 50  # Desai et al. 2020
     num_solving_episodes: int = 20
@@ -241,6 +242,7 @@ class Experiment:
             error = transition_error(method.grounded, grounding, held_out)
             return state, metrics | {"error": error, "error_ratio": error / source_error}
 
+        held_out = thinned(held_out, self.config.num_curve_transitions)
         source_error = self.source_error(held_out)
         params = (source.params, agent_policy, target, held_out, source_error)
         axes = (None, 0, 0, 0, 0)
@@ -252,6 +254,13 @@ class Experiment:
         """Return the ungrounded source's transition error, [seeds]."""
         source = self.worlds.source
         return self.map(lambda data: transition_error(source.env, source.params, data), held_out)
+
+
+def thinned(recorded: Recorded, num_transitions: int) -> Recorded:
+    """Return about so many of the transitions of each seed, [seeds, T, B], evenly in time."""
+    length, num_envs = recorded.transitions.reward.shape[1:]
+    every = max(1, length * num_envs // num_transitions)
+    return jax.tree.map(lambda x: x[:, ::every], recorded)
 
 
 def as_of(source: World, target: World, recorded: Recorded) -> Recorded:
@@ -360,6 +369,8 @@ def _errors(
 ) -> dict[str, np.ndarray]:
     """Return held-out transition errors [seeds] of source, grounded source and baselines."""
     source = experiment.worlds.source
+
+    recorded = thinned(recorded, experiment.config.num_curve_transitions)
 
     def errors(transformer: Params, recorded: Recorded, held_out: Recorded):
         best = best_constant(source.env, source.params, recorded)

@@ -1,5 +1,6 @@
-"""XLA's options for MJX on deep kinematic chains."""
+"""XLA's options for programs that step a model on a CPU."""
 
+import jax
 import mujoco
 import pytest
 
@@ -19,17 +20,33 @@ def no_flags(monkeypatch):
     monkeypatch.delenv("XLA_FLAGS", raising=False)
 
 
-def test_only_deep_chains_in_mjx_are_compiled_without_fusion_emitters():
-    assert compiler_options.compiler_options(make_chain(6)) == {
-        compiler_options.FUSION_EMITTERS: False
-    }
+def test_only_deep_chains_in_mjx_are_compiled_without_fusion_emitters(monkeypatch):
+    without_emitters = {compiler_options.FUSION_EMITTERS: False}
+    assert compiler_options.compiler_options(make_chain(6)) == without_emitters
     assert compiler_options.compiler_options(make_chain(2)) == {}
-    assert compiler_options.compiler_options(make_chain(6, engine="mujoco")) == {}
+    less_optimised = {compiler_options.OPTIMISATION_LEVEL: 1}
+    assert compiler_options.compiler_options(make_chain(6, engine="mujoco")) == less_optimised
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert compiler_options.compiler_options(make_chain(6)) == {}
 
 
 def test_the_users_own_flag_is_left_alone(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", f"--{compiler_options.FUSION_EMITTERS}=true")
     assert compiler_options.compiler_options(make_chain(6)) == {}
+    monkeypatch.setenv("XLA_FLAGS", f"--{compiler_options.OPTIMISATION_LEVEL}=3")
+    assert compiler_options.compiler_options(make_chain(6, engine="mujoco")) == {}
+
+
+def test_chain_depth_counts_dofs_of_the_longest_branch():
+    forked = JOINT + "</body>" + JOINT * 3 + "</body>" * 3
+    spec = mujoco.MjSpec.from_string(f"<mujoco><worldbody>{forked}</worldbody></mujoco>")
+    assert compiler_options.chain_depth(dynamics.compile(spec, engine="mujoco")) == 3
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+def test_the_compiler_takes_the_options(engine):
+    options = compiler_options.compiler_options(make_chain(6, engine))
+    assert jax.jit(lambda x: x + 1, compiler_options=options)(1.0) == 2.0
 
 
 def test_an_option_that_xla_does_not_know_is_not_used(monkeypatch):

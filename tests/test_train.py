@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from garat_jax import checkpoint, compiler_options, dynamics, train
+from garat_jax import checkpoint, compiler_options, train
 from garat_jax.agents import ppo
 from garat_jax.dynamics import Override
 from garat_jax.env import make_world
@@ -14,11 +14,8 @@ from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.errors import DivergedError
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer, UntilSolved
-from tests.models import PENDULUM, spec
 
 SEEDS = [7, 8]
-CHAIN = "<mujoco><worldbody>{}</worldbody></mujoco>"
-LINK = '<body pos="0 0 0.1"><joint axis="0 1 0"/><geom size="0.05"/>{}</body>'
 
 
 class Interrupting(RunDirectory):
@@ -274,32 +271,9 @@ def test_without_a_solution_the_iterations_run_out(tmp_path):
     assert not state.solved.any()
 
 
-def world(depth: int, engine: str):
-    mjcf = ""
-    for _ in range(depth):
-        mjcf = LINK.format(mjcf)
-    return dynamics.compile(spec(CHAIN.format(mjcf)), engine=engine)
-
-
-def test_compiler_options_are_for_deep_chains_in_mjx_on_a_cpu(monkeypatch):
-    flag = {"xla_cpu_use_fusion_emitters": False}
-    deep, shallow = world(6, "mjx"), world(2, "mjx")
-    assert (compiler_options.chain_depth(deep), compiler_options.chain_depth(shallow)) == (6, 2)
-    on_cpu = flag if jax.default_backend() == "cpu" else {}
-    assert compiler_options.compiler_options(deep) == on_cpu
-    assert compiler_options.compiler_options(shallow) == {}
-    assert compiler_options.compiler_options(world(6, "mujoco")) == {}
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert compiler_options.compiler_options(deep) == {}
-
-
-def test_the_compiler_takes_its_options_or_the_run_stops_here(tmp_path):
+def test_options_reach_the_compiler(tmp_path):
     loop = trainer(directory(tmp_path / "run"))
-    options = compiler_options.compiler_options(world(6, "mjx"))
+    options = {compiler_options.OPTIMISATION_LEVEL: 1}
     assert loop.call(lambda x: x + 1, jnp.ones(3), options=options).sum() == 6
-
-
-def test_chain_depth_counts_dofs_of_the_longest_branch():
-    pair = CHAIN.format(LINK.format("") + LINK.format(LINK.format("")))
-    assert compiler_options.chain_depth(dynamics.compile(spec(pair), engine="mujoco")) == 2
-    assert compiler_options.chain_depth(dynamics.compile(spec(PENDULUM), engine="mujoco")) == 1
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no_such_option"):
+        loop.call(lambda x: x + 1, jnp.ones(3), options={"no_such_option": True})

@@ -99,6 +99,22 @@ def flags() -> str:
     return table(columns, rows) + origin("xla_flags", result)
 
 
+def optimisation_level() -> str:
+    result = read("optimisation_level")
+    rows = [
+        (
+            row["pair"].replace("_", " "),
+            row["agent"],
+            "XLA's default" if row["level"] is None else row["level"],
+            f"{row['compile_seconds']:.1f}",
+            f"{row['iteration_seconds']:.2f}",
+        )
+        for row in result["rows"]
+    ]
+    columns = ("pair", "agent", "level", "compilation, s", "an iteration, s")
+    return table(columns, rows) + origin("optimisation_level", result)
+
+
 def real_data() -> str:
     result = read("real_data")
 
@@ -188,6 +204,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "memory": speed_tables.memory,
     "flags": flags,
     "fidelity": fidelity,
+    "optimisation_level": optimisation_level,
     "real_data": real_data,
     "ground": ground,
 }
