@@ -105,7 +105,7 @@ def optimisation_level() -> str:
         (
             row["pair"].replace("_", " "),
             row["agent"],
-            "XLA's default" if row["level"] is None else row["level"],
+            "XLA's default" if row["level"] is None else str(row["level"]),
             f"{row['compile_seconds']:.1f}",
             f"{row['iteration_seconds']:.2f}",
         )
