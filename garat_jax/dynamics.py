@@ -96,6 +96,7 @@ def compile(
         override.apply(spec)
     for effect in effects:
         effect.check(spec.copy().compile())
+        effect.unlock(spec)
         effect.prepare(spec)
     try:
         host = HostModel(spec.compile())

@@ -12,7 +12,7 @@ import numpy as np
 from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.fit import Fit, fit
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, simpler_law
+from garat_jax.diagnosis.screen import EQUIVALENT, VISIBLE, Score, cosine, simpler_law
 from garat_jax.diagnosis.simulate import columns_of
 
 CONTENDERS = 4
@@ -128,19 +128,22 @@ def with_evidence(
         problem: The recordings and the model with every candidate.
         current: The fit of the effects selected so far.
         contenders: The candidates that were fitted.
-        num_tests: How many candidates were scored.
+        num_tests: How many candidates there were, each counted as often as a size of it was tried.
     """
     if not contenders:
         return []
     chosen = np.flatnonzero(problem.fitted)
-    evidence = Evidence(problem.take(chosen), current, current.start[chosen])
+    evidence = Evidence(problem, current, chosen)
     changes = evidence.rest(
         np.stack([(c.fit.residual - current.residual)[chosen] for c in contenders])
     )
     tested = []
     for change, contender in zip(changes.T, contenders, strict=True):
         score = contender.score
-        p_value = evidence.p_value(score.effect, change[:, None], len(score.columns))
+        p_value = 1.0
+        if np.linalg.norm(change) > VISIBLE:
+            num_fitted = len({*score.columns} - {*contender.fit.frozen})
+            p_value = evidence.p_value(score.effect, change[:, None], max(num_fitted, 1))
         score = dataclasses.replace(score, p_value=min(1.0, num_tests * p_value))
         tested.append(dataclasses.replace(contender, score=score))
     return tested

@@ -34,18 +34,19 @@ class Evidence:
     """What some segments say beyond their initial states and the parameters already free.
 
     Args:
-        problem: What is fitted, of these segments only.
+        problem: What is fitted.
         fit: The current fit.
-        start: Its initial states of these segments, [S, nq + nv].
+        chosen: Indices of the segments.
 
     Attributes:
         residual: [M].
     """
 
-    def __init__(self, problem: Problem[Simulator], fit: Fit, start: np.ndarray):
+    def __init__(self, problem: Problem[Simulator], fit: Fit, chosen: np.ndarray):
+        problem, start = problem.take(chosen), fit.start[chosen]
         self._problem, self._theta, self._start = problem, fit.theta, start
         steps = difference_steps(problem, fit.theta, fit.free, 1e-2)
-        lin = linearise(problem, fit.theta, start, fit.free, steps)
+        lin = linearise(problem, fit.theta, start, fit.free, steps, fit.sensitivity[chosen])
         self._space = StartSpace(lin.start)
         self._free = orthonormal(tall(self._space.remove(lin.parameters)))
         self._labels = block_labels(problem).ravel()
@@ -61,20 +62,20 @@ class Evidence:
         moved = simulator.linear_change(thetas, self._theta, self._start, segments)
         return self.rest(self._problem.whiten_change(moved))
 
-    def p_value(self, effect: int, matrix: np.ndarray, num: int | None = None) -> float:
+    def p_value(self, effect: int, matrix: np.ndarray, num_fitted: int | None = None) -> float:
         """Return the probability of such evidence without the effect.
 
         Args:
             effect: Index among the simulator's effects.
             matrix: What it changes, [M, k].
-            num: Number of parameters that were fitted to find the columns; k if not given.
+            num_fitted: As for `wald_test`.
         """
         kind = self._problem.simulator.effects[effect].kind
         nuisances = [self._integrator]
         nuisances += [] if kind in DELAYS else [self._delay]
         nuisances += [] if kind in OFFSETS else [self._offsets]
         nuisance = orthonormal(np.concatenate(nuisances, axis=1))
-        return wald_test(matrix, self.residual, nuisance, self._labels, num)
+        return wald_test(matrix, self.residual, nuisance, self._labels, num_fitted)
 
     def rest(self, columns: np.ndarray) -> np.ndarray:
         """Return changes [k, S, N] less what initial states and free parameters do, [M, k]."""
@@ -82,19 +83,15 @@ class Evidence:
         return without(tall(rest), self._free)
 
     def _common_delay(self, free: Sequence[int]) -> np.ndarray:
-        """Return what a delay changes, [M, 1]; [M, 0] if none is a candidate or one is free."""
+        """Return what a delay changes, [M, 1]; [M, 0] if none is a candidate or any is free."""
         simulator = self._problem.simulator
-        held = [
-            (effect.target != "all", *columns_of(simulator.slots, index).values())
-            for index, effect in enumerate(simulator.effects)
-            if effect.kind in DELAYS
-        ]
-        held = sorted(columns for columns in held if not {*columns[1:]} & {*free})
-        if not held:
+        delays = [i for i, effect in enumerate(simulator.effects) if effect.kind in DELAYS]
+        delays.sort(key=lambda i: simulator.effects[i].target != "all")
+        columns = [j for i in delays for j in columns_of(simulator.slots, i).values()]
+        if not columns or {*columns} & {*free}:
             return np.zeros((len(self.residual), 0))
         moved = self._theta.copy()
-        column = held[0][1]
-        moved[column] += simulator.slots[column].parameter.scale
+        moved[columns[0]] += simulator.slots[columns[0]].parameter.scale
         return self.change(moved[None])
 
 

@@ -94,8 +94,7 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         scores = screen(problem, current, held)
         contenders = fit_contenders(problem, current, scores, say) if gap else []
         contenders = _refine(problem, metric, current, scores, contenders, floor, say)
-        num_tests = sum(not score.excluded for score in scores)
-        contenders = with_evidence(problem, current, contenders, num_tests)
+        contenders = with_evidence(problem, current, contenders, _num_tried(problem, scores))
         judged = _judge(problem, metric, current, scores, contenders, gap)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         candidate, contender = judged[0] if judged else (None, None)
@@ -116,6 +115,12 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
     if not is_above(problem, metric, current, floor):
         best = None
     return Outcome(before, current, candidates, tuple(steps), selected, floor.error, adequate, best)
+
+
+def _num_tried(problem: Problem, scores: Sequence[Score]) -> int:
+    """Return how many sizes of candidates were tried."""
+    tried = (problem.simulator.effects[score.effect] for score in scores if not score.excluded)
+    return sum(len(effect.starts(problem.simulator.host, effect.target)) for effect in tried)
 
 
 def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):

@@ -59,14 +59,16 @@ def wald_test(
     """Return the p-value of a robust test that all of the columns' coefficients are 0.
 
     One column that was fitted with several parameters is tested as that many: the statistic of the
-    combination that explains most is that of all of them together (Scheffé 1953).
+    linear combination that explains most is that of all of them together (Scheffé 1953). What a fit
+    changes is evidence only in the direction in which it does.
 
     Args:
         matrix: Columns, [M, k].
         residual: [M].
         nuisance: Orthonormal columns that are projected out first, [M, n].
         labels: The block of each residual, integers, [M].
-        num_fitted: Number of parameters that were fitted to find the columns; k if not given.
+        num_fitted: Number of parameters that were fitted to find the one column; None where nothing
+            was.
     """
     unit = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     matrix, residual = (
@@ -78,6 +80,8 @@ def wald_test(
     if matrix.shape[1] == 0:
         return 1.0
     found = regress(matrix, residual, labels)
+    if num_fitted is not None and found.coefficient[0] <= 0:
+        return 1.0
     num = num_fitted or matrix.shape[1]
     precision = np.linalg.pinv(found.covariance, hermitian=True)
     statistic = float(found.coefficient @ precision @ found.coefficient) / num

@@ -3,7 +3,7 @@
 A candidate's sensitivity is the change of the predictions at a realistic size of its parameters; a
 law with a threshold, which does nothing below it, is tried at several (`Effect.starts`; see
 `trials`). What initial states and parameters already free can explain is projected out. P-values
-(`evidence`) have Holm's correction (1979).
+(`evidence`) have Holm's correction (1979); those of the candidates that are fitted are replaced.
 """
 
 import dataclasses
@@ -67,8 +67,8 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
     """
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SCREENED)]
+    evidence = Evidence(problem, fit, chosen)
     problem = problem.take(chosen)
-    evidence = Evidence(problem, fit, fit.start[chosen])
     rows, trials, changes = _measure(problem, fit.theta, evidence, skip)
     raw = [_score(problem, evidence, changes, rows, trial) for trial in trials]
     judged = [score for score in raw if not score.excluded]

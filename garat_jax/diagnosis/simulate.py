@@ -1,7 +1,7 @@
 """Simulate every segment of the recordings, for many parameters and initial states, in one call.
 
-One compiled model holds every candidate effect at its nominal value, which is the identity, or at
-the size that it has already; fitting and scoring move its leaves.
+A program holds the candidate effects that act in it, on a model that is compiled for them, and
+moves their leaves; at its nominal value an effect is the identity, so that programs agree.
 """
 
 import dataclasses
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from garat_jax import dynamics
+from garat_jax.compiler_options import OPTIMISATION_LEVEL
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
 from garat_jax.dynamics import Override
@@ -23,7 +24,7 @@ BATCH_SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
 substep, many simulations share its cost. Each size is compiled once."""
 
-UNOPTIMISED = {"xla_backend_optimization_level": 0}
+UNOPTIMISED = {OPTIMISATION_LEVEL: 0}
 """Of programs that wait for C MuJoCo: to optimise what is around it takes longer than it saves."""
 
 
@@ -89,7 +90,13 @@ class Simulator:
             acting: Indices of candidates that are not at their nominal, and act as they are.
         """
         timestep = Override("option", "", "timestep", grid.timestep / refine)
-        self._model = dataclasses.replace(model, overrides=(*model.overrides, timestep))
+        spec = model.spec.copy()
+        host = model.spec.copy().compile()
+        for effect in candidates:
+            effect.check(host)
+            effect.unlock(spec)
+        overrides = (*model.overrides, timestep)
+        self._model = dataclasses.replace(model, spec=spec, overrides=overrides)
         self.effects = tuple(candidates)
         self._alone = self._compile(())
         self._substeps = grid.substeps * refine
@@ -190,7 +197,7 @@ class Simulator:
         for i, row in enumerate(theta):
             moved = {*self._owner[row != base].tolist()}
             kinds = " ".join(sorted({self.effects[j].kind for j in moved}))
-            acting = {*self._acting(row[None])}
+            acting = {*self._acting(np.stack([base, row]))}
             if self._any_at_once and acting <= blind:
                 way = ("at once", "")
             elif self._any_at_once and moved <= memoryless and acting <= memoryless:

@@ -256,6 +256,13 @@ class Effect(abc.ABC):
         del spec
         return f"MJCF has no words for {self.kind} at {self.target}"
 
+    def unlock(self, spec: mujoco.MjSpec) -> None:  # noqa: B027
+        """Turn off what MuJoCo's compiler assumes of the model and the effect may break.
+
+        Unlike what `prepare` adds, this changes how the model moves, slightly, so models that are
+        compared must have it alike.
+        """
+
     def prepare(self, spec: mujoco.MjSpec) -> None:  # noqa: B027
         """Change the model's structure, before it is compiled, so that the law can act."""
 

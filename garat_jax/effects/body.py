@@ -74,10 +74,13 @@ class PayloadMass(Effect):
         sizes = (share * max(carried, SMALLEST_MASS) for share in PAYLOADS)
         return tuple({mass.name: min(size, mass.high)} for size in sizes)
 
+    def unlock(self, spec: mujoco.MjSpec) -> None:
+        """Keep the compiler from taking the centre of mass for the body's origin."""
+        spec.body(self.name).simple = False
+
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Weld a body of negligible mass to the target, which the compiler may not fuse."""
         self._add_body(spec, [0.0, 0.0, 0.0], SMALLEST_MASS).fuse = False
-        spec.body(self.name).simple = False
 
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Give the payload's body its mass and place, whatever bounds the compiler set."""
@@ -136,7 +139,7 @@ class ComOffset(Effect):
         """Say whether the body moves and has mass."""
         return bool(name) and moves(host, name) and host.body(name).mass[0] > 0
 
-    def prepare(self, spec: mujoco.MjSpec) -> None:
+    def unlock(self, spec: mujoco.MjSpec) -> None:
         """Keep the compiler from taking the centre of mass for the body's origin."""
         spec.body(self.name).simple = False
 

@@ -1,0 +1,45 @@
+"""Programs are compiled for the candidates that act, and agree where these do nothing."""
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.diagnose import make_candidates
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.dynamics import native_model
+from garat_jax.effects.transmission import Transmission
+from tests import models
+
+TIME = np.arange(101) * 0.005
+HARDLY = 1e-9
+"""Size at which a candidate acts without being felt, relative to its parameter's scale."""
+
+
+def make_simulator(mjcf: str):
+    """Return a model with every candidate, and segments that begin where it falls and is pushed."""
+    model = Model("model", __file__, __file__, models.spec(mjcf))
+    host = native_model(model.compile(engine="mujoco"))
+    states = np.tile(host.qpos0, (len(TIME), 1)), np.zeros((len(TIME), host.nv))
+    ctrl = 0.3 * np.sign(np.sin(20 * TIME))[:, None] * np.ones(host.nu)
+    recording = Recording("made", TIME, *states, ctrl, {}, True, ((0, len(TIME)),), ())
+    grid = choose_grid([recording], host.opt.timestep)
+    simulator = Simulator(model, make_candidates(model, host), grid)
+    return simulator, cut([recording], grid, 0.25)
+
+
+@pytest.mark.parametrize("mjcf", [models.SLIDER, models.ARM])
+def test_a_candidate_that_does_nothing_predicts_what_the_model_does_without_it(mjcf):
+    simulator, segments = make_simulator(mjcf)
+    alone = simulator.predict(simulator.base[None], segments.start[None], segments)[0]
+    assert np.ptp(alone, axis=1).max() > 0.01
+    for index, effect in enumerate(simulator.effects):
+        if isinstance(effect, Transmission):
+            continue  # a motor that is apart from its joint, however little, is a body more
+        theta = simulator.base.copy()
+        j = next(j for j, slot in enumerate(simulator.slots) if slot.effect == index)
+        p = simulator.slots[j].parameter
+        theta[j] += HARDLY * p.scale * (-1 if theta[j] >= p.high else 1)
+        beside = simulator.predict(theta[None], segments.start[None], segments)[0]
+        assert np.abs(beside - alone).max() < 1e-5, (effect.kind, effect.target)
