@@ -5,6 +5,7 @@ settings that they stand for as `settings`, seeds, versions, machine), `metrics.
 logged step), and whatever the command adds to it: summaries, checkpoints, plots, `report.html`.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -78,7 +79,8 @@ class RunDirectory:
                 raise UserError(
                     f"{root} exists already: give --force to replace it, {go_on}or another --out"
                 )
-            _remove_run(root)
+            _check_replaceable(root)
+            shutil.rmtree(root)
         try:
             root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -126,8 +128,7 @@ class RunDirectory:
 
     def discard(self) -> None:
         """Remove the folder if nothing came of the run: `config.json` is all that it holds."""
-        files = [path for path in self.root.rglob("*") if path.is_file()]
-        if not self.resumed and files == [self.root / CONFIG]:
+        if not self.resumed and not _holds_results(self.root):
             shutil.rmtree(self.root)
 
     def path(self, name: str) -> Path:
@@ -235,6 +236,43 @@ def finite_or_null(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+@contextlib.contextmanager
+def earlier_run_kept(root: Path) -> Iterator[None]:
+    """Keep the run that a folder holds until another one has results in its place.
+
+    Where the block leaves the folder without results, because the input was wrong, the earlier run
+    is put back.
+
+    Args:
+        root: The folder that a run with `force` will replace.
+
+    Raises:
+        UserError: The folder holds something else than a run, or the current folder is within it.
+    """
+    aside = root.with_name(f".{root.name}.replaced")
+    if aside.exists() and not root.exists():  # a process was killed before it put it back
+        aside.rename(root)
+    if not _is_occupied(root):
+        yield
+        return
+    _check_replaceable(root)
+    shutil.rmtree(aside, ignore_errors=True)
+    root.rename(aside)
+    try:
+        yield
+    finally:
+        if _holds_results(root):
+            shutil.rmtree(aside)
+        else:
+            shutil.rmtree(root, ignore_errors=True)
+            aside.rename(root)
+
+
+def _holds_results(root: Path) -> bool:
+    """Say whether there is more in a run directory than how it was begun."""
+    return any(path.is_file() and path != root / CONFIG for path in root.rglob("*"))
+
+
 def _is_occupied(root: Path) -> bool:
     if root.exists() and not root.is_dir():
         raise UserError(f"{root} is a file; expected a folder for the run")
@@ -269,8 +307,8 @@ def _leaves(record: Any, name: str) -> dict[str, Any]:
     return flat
 
 
-def _remove_run(root: Path) -> None:
-    """Delete an earlier run; anything that is not recognisably one stays."""
+def _check_replaceable(root: Path) -> None:
+    """Refuse to touch what is not recognisably an earlier run."""
     if not is_run(root) or root.is_symlink():
         raise UserError(
             f"{root} is not empty and holds no run, so --force leaves it alone; give another --out"
@@ -280,7 +318,6 @@ def _remove_run(root: Path) -> None:
             f"{root} is the current folder or holds it, so --force leaves it alone; "
             "change the folder first"
         )
-    shutil.rmtree(root)
 
 
 def _write_whole(path: Path, text: str) -> Path:

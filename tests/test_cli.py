@@ -77,6 +77,7 @@ def test_version():
         (["compare", __file__, "no.csv"], ["DATA", "there is no file no.csv"]),
         (["diagnose", __file__, "no.csv"], ["DATA", "there is no file no.csv"]),
         (["diagnose", __file__, __file__, "--holdout", "no.csv"], ["--holdout", "no file no.csv"]),
+        (["diagnose", __file__, __file__, "--holdout", __file__], ["test_cli.py is given twice"]),
         (["demo", "--measurements", "nowhere"], ["--measurements", "no folder nowhere"]),
     ],
 )

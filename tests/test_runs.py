@@ -8,7 +8,7 @@ import pytest
 
 from garat_jax.errors import UserError
 from garat_jax.provenance import git_state, provenance
-from garat_jax.runs import RunDirectory, to_plain
+from garat_jax.runs import RunDirectory, earlier_run_kept, to_plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +49,33 @@ def test_a_folder_that_is_not_empty_is_refused_in_one_line(tmp_path):
     with pytest.raises(UserError, match=r"--force.*--resume") as refusal:
         create(tmp_path)
     assert "\n" not in str(refusal.value)
+
+
+def test_an_earlier_run_stays_where_the_next_one_has_no_results(tmp_path):
+    create(tmp_path / "run").log(1, loss=1.0)
+    with pytest.raises(UserError, match="wrong input"), earlier_run_kept(tmp_path / "run"):
+        create(tmp_path / "run", seeds=[7])
+        raise UserError("wrong input")
+    run = RunDirectory.open(tmp_path / "run")
+    assert run.read_json("config.json")["seeds"] == [0, 1]
+    assert len(list(run.metrics())) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_earlier_run_goes_where_the_next_one_has_results(tmp_path):
+    create(tmp_path / "run").log(1, loss=1.0)
+    with earlier_run_kept(tmp_path / "run"):
+        create(tmp_path / "run", seeds=[7]).log(2, loss=3.0)
+    run = RunDirectory.open(tmp_path / "run")
+    assert run.read_json("config.json")["seeds"] == [7]
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_earlier_run_that_a_killed_process_put_aside_comes_back(tmp_path):
+    create(tmp_path / ".run.replaced").log(1, loss=1.0)
+    with pytest.raises(UserError), earlier_run_kept(tmp_path / "run"):
+        raise UserError("wrong input")
+    assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1
 
 
 def test_force_replaces_a_run(tmp_path):

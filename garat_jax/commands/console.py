@@ -46,7 +46,8 @@ def make_run(
 ) -> Iterator["RunDirectory"]:
     """Make the run directory of a command; the command's fields are the run's config.
 
-    Wrong input that shows only within the block leaves no empty run behind.
+    Wrong input that shows only within the block leaves no empty run behind, and an earlier run that
+    --force would have replaced stays.
 
     Args:
         command: A command with a field `force`.
@@ -54,7 +55,7 @@ def make_run(
         seeds: The seeds of the run.
         resume: Go on with the run that the folder holds; None if the command cannot.
     """
-    from garat_jax.runs import RunDirectory
+    from garat_jax.runs import RunDirectory, earlier_run_kept
 
     config = {
         field.name: getattr(command, field.name)
@@ -62,14 +63,28 @@ def make_run(
         if field.name not in ("out", "force", "resume")
     }
     line = shlex.join([PROGRAM, *sys.argv[1:]])
-    run = RunDirectory.create(out, config, line, seeds, force=command.force, resume=resume)
-    if run.resumed and (changed := run.changed_versions()):
-        complain(f"warning: the run was begun with other versions: {', '.join(changed)}", 0)
-    try:
-        yield run
-    except (UserError, RuntimeError):
-        run.discard()
-        raise
+    replaces = command.force and not resume
+    if replaces:
+        _check_outside(command, out)
+    with earlier_run_kept(out) if replaces else contextlib.nullcontext():
+        run = RunDirectory.create(out, config, line, seeds, force=command.force, resume=resume)
+        if run.resumed and (changed := run.changed_versions()):
+            complain(f"warning: the run was begun with other versions: {', '.join(changed)}", 0)
+        try:
+            yield run
+        except (UserError, RuntimeError):
+            run.discard()
+            raise
+
+
+def _check_outside(command: Any, out: Path) -> None:
+    """Refuse input that lies in the folder that --force is about to replace."""
+    for field in dataclasses.fields(command):
+        given = getattr(command, field.name)
+        for path in given if isinstance(given, tuple) else (given,):
+            inside = isinstance(path, Path) and path.resolve().is_relative_to(out.resolve())
+            if inside and field.name != "out":
+                raise UserError(f"{path} is in {out}, which --force replaces; give another --out")
 
 
 def check_files(paths: Sequence[Path], what: str) -> None:

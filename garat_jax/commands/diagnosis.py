@@ -51,9 +51,16 @@ class WithHoldout(OnRecordings):
     """Recordings to prove the result on; by default some of DATA are held out."""
 
     def check(self) -> None:
-        """Refuse files that are not there."""
+        """Refuse files that are not there, and proof on what was fitted."""
         super().check()
         check_files(self.holdout or self.data, "--holdout")
+        seen = set[Path]()
+        for path in (*self.data, *self.holdout):
+            if path.resolve() in seen:
+                raise UserError(
+                    f"{path} is given twice; a recording is either fitted or held out, once"
+                )
+            seen.add(path.resolve())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -81,13 +81,14 @@ class Export:
         """Write the MJCF."""
         check_files([self.model], "MODEL")
         check_out(self.out, ".xml", self.force)
-        if self.out.resolve() == self.model.resolve():
-            raise UserError(f"--out {self.out} is MODEL itself; give another name")
         from garat_jax.diagnosis import load_model
         from garat_jax.diagnosis.export import export_mjcf
         from garat_jax.effects.catalogue import load_catalogue
 
-        done = export_mjcf(load_model(self.model, load_catalogue(self.effects)), self.out)
+        model = load_model(self.model, load_catalogue(self.effects))
+        if self.out.resolve() in (model.path.resolve(), model.mjcf.resolve()):
+            raise UserError(f"--out {self.out} is what MODEL is made of; give another name")
+        done = export_mjcf(model, self.out)
         for line in done.unsaid:
             say(f"not in MJCF: {line}")
         say(f"MJCF: {done.path}")

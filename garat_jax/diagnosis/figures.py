@@ -9,7 +9,7 @@ from plotly.subplots import make_subplots
 from garat_jax.diagnosis.localise import MissingTorque, Place
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.replay import Replay
-from garat_jax.diagnosis.results import Candidate, Diagnosis
+from garat_jax.diagnosis.results import Candidate, Diagnosis, Named
 from garat_jax.report import COLOURS, SOFT, styled
 
 AFTER, BEFORE, GOOD = COLOURS[0], COLOURS[1], COLOURS[2]
@@ -28,7 +28,7 @@ def words(kind: str) -> str:
     return kind.replace("_", " ")
 
 
-def label(candidate: Candidate) -> str:
+def label(candidate: Candidate | Named) -> str:
     """Return an effect and its place as words."""
     return f"{words(candidate.effect)} at {candidate.target}"
 

@@ -11,7 +11,7 @@ from garat_jax.diagnosis.fit import settle
 from garat_jax.diagnosis.measurements import Recording, estimate_velocity, signals
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.segments import Grid, Segments, choose_grid, cut
+from garat_jax.diagnosis.segments import QUIET, Grid, Segments, choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 
 
@@ -60,7 +60,8 @@ class Replay:
         """Return the part of some recordings, by number; spreads are those within them."""
         kept = np.isin(self.segments.recording, list(recordings))
         segments = self.segments.take(kept)
-        spread = segments.measured[segments.weight > 0].std(axis=0) + 1e-12
+        spread = segments.measured[segments.weight > 0].std(axis=0)
+        spread = np.maximum(spread, QUIET * segments.noise)
         segments = dataclasses.replace(segments, spread=spread)
         return dataclasses.replace(self, segments=segments, predicted=self.predicted[kept])
 
@@ -113,7 +114,10 @@ def replay_with(
     horizon: float,
     chosen: Sequence[int] | None = None,
 ) -> Replay:
-    """Predict all recordings, or chosen ones, with a simulator that is compiled; see `replay`."""
+    """Predict all recordings, or chosen ones, with a simulator that is compiled; see `replay`.
+
+    Spreads, by which errors are told, are those within the recordings predicted.
+    """
     segments = cut(recordings, grid, horizon)
     if chosen is not None:
         segments = segments.take(np.isin(segments.recording, list(chosen)))
@@ -123,13 +127,14 @@ def replay_with(
     settled = settle(problem, simulator.base, segments.start)
     residual = settled.residual.reshape(segments.measured.shape)
     of_state = signals(simulator.host)[: segments.measured.shape[2]]
-    return Replay(
+    played = Replay(
         horizon=horizon,
         names=tuple(s.name for s in of_state),
         units=tuple(s.unit for s in of_state),
         segments=segments,
         predicted=segments.measured + residual * segments.noise,
     )
+    return played if chosen is None else played.only(chosen)
 
 
 def as_recordings(

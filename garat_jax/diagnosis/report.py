@@ -62,7 +62,7 @@ def write_diagnosis(
 def diagnosis_lead(diagnosis: Diagnosis) -> str:
     """Return the result in words for a reader who was not there."""
     error = diagnosis.error
-    names = " and ".join(label(c) for c in diagnosis.selected)
+    names = " and ".join(_label_with_alike(c) for c in diagnosis.selected)
     floor = f"noise alone makes {_percent(error.noise_floor)}"
     if diagnosis.verdict == "adequate":
         return (
@@ -79,6 +79,15 @@ def diagnosis_lead(diagnosis: Diagnosis) -> str:
     if names:
         return f"The model lacks {names}, but that is not all. With it, {fall}: {rest}."
     return f"Something is missing that no effect in the catalogue explains: {rest}."
+
+
+def _label_with_alike(candidate: Candidate) -> str:
+    """Name an effect, and the others that these recordings cannot tell from it."""
+    alike = [label(other) for other in candidate.indistinguishable_from]
+    if not alike:
+        return label(candidate)
+    others = " or ".join(alike) if len(alike) < 3 else f"one of {len(alike)} others"
+    return f"{label(candidate)} (or {others}: these recordings cannot tell)"
 
 
 def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:

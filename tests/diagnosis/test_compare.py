@@ -12,6 +12,7 @@ from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
 from garat_jax.diagnosis.segments import Segments
+from garat_jax.runs import RunDirectory
 from tests import models
 
 
@@ -145,3 +146,18 @@ def test_predictions_take_the_place_of_measurements(recorded):
             np.testing.assert_array_equal(made.qpos[a:b], original.qpos[a:b])
             np.testing.assert_array_equal(made.qvel[a:b], original.qvel[a:b])
         assert made.spans[0][0] == 0
+
+
+def test_wrong_input_leaves_the_run_that_it_would_have_replaced(tmp_path, capsys):
+    model, data, out = (tmp_path / name for name in ("pendulum.xml", "bad.csv", "run"))
+    model.write_text(models.PENDULUM)
+    data.write_text("time,nothing\n0,1\n")
+    RunDirectory.create(out, {}, "garat compare", []).log(1, error=1.0)
+    assert cli.main(["compare", str(model), str(data), "--out", str(out), "--force"]) == 2
+    (line,) = RunDirectory.open(out).metrics()
+    assert line["error"] == 1.0
+    inside = out / "data.csv"
+    data.rename(inside)
+    assert cli.main(["compare", str(model), str(inside), "--out", str(out), "--force"]) == 2
+    assert "which --force replaces" in capsys.readouterr().err
+    assert inside.is_file()

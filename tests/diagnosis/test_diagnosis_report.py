@@ -3,6 +3,7 @@
 import dataclasses
 import re
 
+import numpy as np
 import pytest
 
 from garat_jax.diagnosis import Diagnosis, Recording, load_model
@@ -112,7 +113,8 @@ def test_page_of_a_missing_effect_has_every_part(tmp_path):
         "How to get these results again",
     ):
         assert f"<h2>{heading}</h2>" in page
-    assert "The model lacks coulomb friction at joint/hinge." in page
+    named = "coulomb friction at joint/hinge (or viscous damping at joint/hinge: these recordings"
+    assert f"The model lacks {named} cannot tell)." in page
     assert "torque 0.06 (0.055 to 0.065) N m" in page
     assert "these recordings cannot tell it from viscous damping at joint/hinge" in page
     assert "Swing at two amplitudes." in page
@@ -142,7 +144,7 @@ def test_page_of_an_unexplained_gap_says_what_is_left_and_offers_to_learn_it(tmp
         ({}, "falls from 20 % to 1.1 % of the signals' spread; noise alone makes 1 %."),
         (
             {"verdict": "unexplained"},
-            "lacks coulomb friction at joint/hinge, but that is not all",
+            "these recordings cannot tell), but that is not all",
         ),
         (
             {"verdict": "unexplained", "selected": ()},
@@ -162,8 +164,11 @@ def test_what_a_repair_explains_is_not_left(tmp_path):
     recordings = [Recording.read(file, model) for file in (*made.fit, *made.holdout)]
     size = Estimate(made.parameters["torque"], 0.0, 1.0, "N m")
     found = dataclasses.replace(FRICTION, parameters={"torque": size})
-    before, after = (leftover(look(model, recordings, (1,), chosen)) for chosen in ((), (found,)))
-    shares = [{p.regime: p.share for p in places} for places in (before, after)]
+    views = [look(model, recordings, (1,), chosen) for chosen in ((), (found,))]
+    for played in zip(views[1].before, views[1].after, strict=True):
+        spreads = [p.segments.spread for p in played]
+        np.testing.assert_array_equal(*spreads)  # or errors before and after do not compare
+    shares = [{p.regime: p.share for p in leftover(view)} for view in views]
     friction = "against or with the motion"
     assert shares[0][friction] > 0.5
     assert shares[1].get(friction, 0.0) < 0.3 * shares[0][friction]
