@@ -131,7 +131,7 @@ def _npz(log: Path) -> dict[str, np.ndarray]:
 
 
 def _mat(log: Path) -> dict[str, np.ndarray]:
-    """Read a MAT file; fields of structures are named `a.b`."""
+    """Read a MAT file; fields of structures are named `a.b`, cells `a.0`, `a.1` and so on."""
     try:
         content = io.loadmat(log, simplify_cells=True)
     except NotImplementedError as error:
@@ -146,6 +146,10 @@ def _flatten(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarr
     for name, value in content.items():
         if isinstance(value, dict):
             flat |= _flatten(value, f"{prefix}{name}.")
+        elif isinstance(value, np.ndarray) and value.dtype == object:
+            flat |= _flatten(
+                {str(i): cell for i, cell in enumerate(value.flat)}, f"{prefix}{name}."
+            )
         elif np.asarray(value).dtype.kind in "fiub":
             flat[prefix + name] = np.asarray(value, float)
     return flat

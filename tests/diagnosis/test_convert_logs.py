@@ -59,6 +59,16 @@ def test_mat_with_a_structure(tmp_path):
     check(convert(tmp_path, tmp_path / "log.mat", columns, 'time = "run.t"')[1])
 
 
+def test_mat_with_cells_of_recordings_that_are_not_equally_long(tmp_path):
+    made, cells = arrays(), {}
+    for name, array in made.items():
+        cells[name] = np.empty(2, object)
+        cells[name][:] = [array[:5], array]
+    io.savemat(tmp_path / "log.mat", cells)
+    columns = OF_ARRAYS.replace("state[", "state.1[").replace('"u"', '"u.1"')
+    check(convert(tmp_path, tmp_path / "log.mat", columns, 'time = "t.1"')[1])
+
+
 @pytest.mark.parametrize("name", ["log.csv", "log.parquet"])
 def test_foreign_tables(tmp_path, name, capsys):
     frame = pd.DataFrame({"t": STAMPS, "a": ANGLE, "s": SPEED, "u": STAMPS, "note": "x"})
