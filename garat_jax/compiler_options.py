@@ -20,8 +20,8 @@ def compiler_options(dynamics: Dynamics) -> dict[str, Any]:
 
     XLA's CPU fusion emitters make MJX up to hundreds of times slower on deep kinematic chains
     (github.com/jax-ml/jax/issues/33761) and shallow ones slightly faster. Around C MuJoCo, which is
-    not touched by them, LLVM's higher levels of optimisation cost up to a quarter of the compile time
-    and save nothing; see docs/performance.md. What the user put in XLA_FLAGS stays as it is.
+    not touched by them, LLVM's higher levels of optimisation cost up to a quarter of the compile
+    time and save nothing; see docs/performance.md. What the user put in XLA_FLAGS stays as it is.
     """
     if jax.default_backend() != "cpu":
         return {}

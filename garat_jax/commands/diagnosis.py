@@ -223,8 +223,8 @@ class Plan:
         if not 2.0 <= self.seconds <= 600.0:
             raise UserError(f"--seconds {self.seconds:g}: expected 2 to 600")
         from garat_jax.diagnosis import load_model
-        from garat_jax.diagnosis.compare import tell
         from garat_jax.diagnosis.plan import parse_place, plan, write_plan
+        from garat_jax.diagnosis.progress import tell
         from garat_jax.effects.catalogue import load_catalogue
 
         model = load_model(self.model, load_catalogue(self.effects))

@@ -48,8 +48,9 @@ class Add:
         check_out(self.out, ".toml", self.force)
         from garat_jax.diagnosis import load_model
         from garat_jax.diagnosis.add import choose_effect, size
-        from garat_jax.diagnosis.compare import read_recordings, tell
+        from garat_jax.diagnosis.compare import read_recordings
         from garat_jax.diagnosis.model_card import mjcf_in_card, save_card
+        from garat_jax.diagnosis.progress import tell
         from garat_jax.effects.catalogue import load_catalogue
 
         model = load_model(self.model, load_catalogue(self.effects))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import html
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import ABOVE_FLOOR, Floor, make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.quality import Quality, assess
 from garat_jax.diagnosis.replay import Replay, Size, replay_with
 from garat_jax.diagnosis.residuals import Residuals, examine
@@ -234,11 +234,6 @@ def read_recordings(
         for warning in recording.warnings:
             tell(f"warning: {warning}")
     return recordings
-
-
-def tell(message: str) -> None:
-    """Write a line of progress on stderr."""
-    sys.stderr.write(f"{message}\n")
 
 
 def _check_alike(other: Model, model: Model, host: mujoco.MjModel) -> None:

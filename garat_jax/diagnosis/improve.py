@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
@@ -17,6 +16,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, load_model, save_card
 from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.progress import progress
 from garat_jax.diagnosis.repeat import found_theta, nominal_effects, repeatability
 from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosis_sections
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
@@ -192,11 +192,11 @@ def run_improve(
     loaded = load_model(model, catalogue)
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
     copied = copy_model(loaded, run.path("model"))
-    with Console(stderr=True).status("reading the recordings") as status:
-        done = improve(loaded, recordings, held_out, status.update)
+    with progress("looking at the recordings") as say:
+        done = improve(loaded, recordings, held_out, say)
         run.write_json("improve.json", finite_or_null(to_plain(done.to_json())))
         save_card(run.path("model.toml"), dataclasses.replace(done.model, mjcf=copied))
-        status.update("writing the report")
+        say("writing the report")
         sections = diagnosis_sections(done.diagnosis, loaded, recordings, held_out)
     report.write(
         run.path("report.html"),

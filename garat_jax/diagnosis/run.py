@@ -10,6 +10,7 @@ from rich.console import Console
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.conditions import diagnose_conditions
 from garat_jax.diagnosis.model_card import load_model
+from garat_jax.diagnosis.progress import progress
 from garat_jax.diagnosis.repeat import repeatability
 from garat_jax.diagnosis.report import diagnosis_sections, write_diagnosis
 from garat_jax.diagnosis.results import Diagnosis
@@ -54,12 +55,12 @@ def run_diagnose(
     others = {
         name: read_recordings(loaded, paths, columns) for name, paths in (conditions or {}).items()
     }
-    with Console(stderr=True).status("reading the recordings") as status:
-        diagnosis = diagnose_conditions(loaded, recordings, others, held_out, status.update)
-        again = repeatability(loaded, recordings, held_out, diagnosis.selected, status.update)
+    with progress("looking at the recordings") as say:
+        diagnosis = diagnose_conditions(loaded, recordings, others, held_out, say)
+        again = repeatability(loaded, recordings, held_out, diagnosis.selected, say)
         diagnosis = dataclasses.replace(diagnosis, repeatability=again)
         run.write_json("diagnosis.json", diagnosis.to_json())
-        status.update("writing the report")
+        say("writing the report")
         sections = diagnosis_sections(diagnosis, loaded, recordings, held_out)
         write_diagnosis(run, diagnosis, loaded.name, sections)
     Console(highlight=False, markup=False, soft_wrap=True).print(str(diagnosis))

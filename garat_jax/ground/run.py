@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import plotly.graph_objects as go
 
 from garat_jax import report
-from garat_jax.diagnosis.compare import read_recordings, tell
+from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.export import copy_model
 from garat_jax.diagnosis.model_card import Model, load_model, save_card
+from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.report_data import side_by_side_section
 from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue, run_python
