@@ -2,6 +2,7 @@
 
 import dataclasses
 import html
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
@@ -34,6 +35,11 @@ class Estimate(Interval):
     """A parameter with its 95 % interval and unit; the ends are NaN where the data say nothing."""
 
     unit: str
+
+    def __str__(self) -> str:
+        known = math.isfinite(self.low) and math.isfinite(self.high)
+        ends = f" [{self.low:.4g}, {self.high:.4g}]" if known else ""
+        return f"{self.estimate:.4g}{ends} {self.unit}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,10 +91,7 @@ class Candidate:
     @property
     def sizes(self) -> str:
         """The parameters with their intervals and units."""
-        return ", ".join(
-            f"{name} {v.estimate:.4g} [{v.low:.4g}, {v.high:.4g}] {v.unit}"
-            for name, v in self.parameters.items()
-        )
+        return ", ".join(f"{name} {value}" for name, value in self.parameters.items())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,9 +273,10 @@ class Diagnosis:
         lines = [self.sentence]
         lines += [f"  where: {place.evidence}" for place in self.where[:3]]
         for c in self.candidates[:6]:
+            fitted = f", held-out error {c.error_after:.3g}, stability {c.stability:.2f}"
             lines.append(
-                f"  {'*' if c.passes else ' '} {c.named}: {c.sizes}; share {c.share:.2f}, "
-                f"held-out error {c.error_after:.3g}, stability {c.stability:.2f}; {c.why}"
+                f"  {'*' if c.passes else ' '} {c.named}: {c.sizes}; share {c.share:.2f}"
+                f"{fitted if math.isfinite(c.error_after) else ' expected'}; {c.why}"
             )
         for rung in self.ladder:
             added = str(rung.added.named) if rung.added else "the model as it is"

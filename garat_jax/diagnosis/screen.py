@@ -144,7 +144,8 @@ def _score(
     steps = np.abs([rows[i].step for i in chosen])
     width = np.asarray([p.high - p.low for p in slots])
     is_tried = np.asarray([rows[i].column in trial.start for i in chosen]) & (not trial.is_only)
-    seen = norm * np.where(is_tried, 1.0, np.maximum(width / steps, 1.0)) > VISIBLE
+    times = np.divide(width, steps, out=np.ones_like(width), where=steps > 0)
+    seen = norm * np.where(is_tried, 1.0, np.maximum(times, 1.0)) > VISIBLE
     seen &= norm > 1e-3 * norm.max(initial=0.0)
     given = [k for k, i in enumerate(chosen) if rows[i].column in trial.start]
     if unseen := [slots[k].name for k in (0, *given) if not seen[k]]:
