@@ -249,7 +249,8 @@ def earlier_run_kept(root: Path) -> Iterator[None]:
     Raises:
         UserError: The folder holds something else than a run, or the current folder is within it.
     """
-    aside = root.with_name(f".{root.name}.replaced")
+    root = Path(os.path.abspath(root))  # `.` has no name
+    aside = root.parent / f".{root.name}.replaced"
     if aside.exists() and not root.exists():  # a process was killed before it put it back
         aside.rename(root)
     if not _is_occupied(root):

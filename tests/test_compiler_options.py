@@ -43,12 +43,6 @@ def test_chain_depth_counts_dofs_of_the_longest_branch():
     assert compiler_options.chain_depth(dynamics.compile(spec, engine="mujoco")) == 3
 
 
-@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
-def test_the_compiler_takes_the_options(engine):
-    options = compiler_options.compiler_options(make_chain(6, engine))
-    assert jax.jit(lambda x: x + 1, compiler_options=options)(1.0) == 2.0
-
-
 def test_an_option_that_xla_does_not_know_is_not_used(monkeypatch):
     assert compiler_options.is_known_option(compiler_options.FUSION_EMITTERS)
     assert not compiler_options.is_known_option("xla_cpu_option_that_is_gone")

@@ -71,6 +71,15 @@ def test_an_earlier_run_goes_where_the_next_one_has_results(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+def test_the_current_folder_may_be_named_by_a_dot(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with earlier_run_kept(Path()):
+        create(Path()).log(1, loss=1.0)
+    with pytest.raises(UserError, match="current folder"), earlier_run_kept(Path()):
+        raise AssertionError
+    assert len(list(RunDirectory.open(tmp_path).metrics())) == 1
+
+
 def test_an_earlier_run_that_a_killed_process_put_aside_comes_back(tmp_path):
     create(tmp_path / ".run.replaced").log(1, loss=1.0)
     with pytest.raises(UserError), earlier_run_kept(tmp_path / "run"):
