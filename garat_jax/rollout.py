@@ -165,8 +165,21 @@ def evaluate(
     policy_params: Params,
     key: jax.Array,
     num_episodes: int,
+    wanted: jax.Array | bool = True,
 ) -> jax.Array:
-    """Return undiscounted returns [num_episodes] of whole episodes; stop when all have ended."""
+    """Return undiscounted returns [num_episodes] of whole episodes; stop when all have ended.
+
+    An episode that is over costs no physics while others last.
+
+    Args:
+        env: The environment.
+        params: Its parameters.
+        policy: The policy.
+        policy_params: The policy's parameters.
+        key: PRNG key.
+        num_episodes: How many.
+        wanted: False for no episodes and returns of zero, [].
+    """
     shares = split.num_shares(num_episodes)
     reset_key, key = jax.random.split(key)
     keys = jax.random.split(key, env.episode_length)
@@ -177,6 +190,7 @@ def evaluate(
     def step(carry):
         length, _, state, alive, total = carry
         key = keys[length]
+        state = state._replace(physics=_only(alive, state.physics))
         state, transition, _ = _step(env, params, policy, policy_params, state, key, shares)
         total = total + alive * transition.reward
         alive = alive & ~(transition.terminated | transition.truncated)
@@ -185,9 +199,21 @@ def evaluate(
         return length, goes_on, state, alive, total
 
     state = split.own_share(reset(env, params, reset_key, num_episodes), shares)
-    alive, total = jnp.ones_like(state.steps, bool), jnp.zeros(state.steps.shape)
-    carry = (0, jnp.ones((), bool), state, alive, total)
+    wanted = jnp.asarray(wanted)
+    alive, total = jnp.full(state.steps.shape, wanted), jnp.zeros(state.steps.shape)
+    carry = (0, wanted, state, alive, total)
     return split.join(jax.lax.while_loop(is_unfinished, step, carry)[4], shares)
+
+
+def _only(chosen: jax.Array, physics):
+    """Leave out of the next step physics [B] not chosen: C MuJoCo skips states that are NaN."""
+
+    def select(x: jax.Array) -> jax.Array:
+        if not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        return jnp.where(chosen.reshape(chosen.shape + (1,) * (x.ndim - 1)), x, jnp.nan)
+
+    return jax.tree.map(select, physics)
 
 
 def replay(env: Env, params: Params, recorded: Recorded, key: jax.Array) -> jax.Array:

@@ -256,11 +256,24 @@ def _with_finite(step):
 
 
 class UntilSolved(NamedTuple):
-    """A learner that stays as it is once it has solved its task."""
+    """A learner that stays as it is once it has solved its task.
+
+    Attributes:
+        state: The learner.
+        score: Mean return at its last evaluation, [].
+        solved: Whether that solved the task, [].
+        key: PRNG key.
+    """
 
     state: Any
+    score: jax.Array
     solved: jax.Array
     key: jax.Array
+
+    @classmethod
+    def start(cls, state: Any, key: jax.Array) -> "UntilSolved":
+        """Return a learner that has not been evaluated."""
+        return cls(state, jnp.zeros(()), jnp.zeros((), bool), key)
 
 
 def until_solved(step, evaluate, solved_return: float):
@@ -268,7 +281,8 @@ def until_solved(step, evaluate, solved_return: float):
 
     Args:
         step: `(state, params) -> (state, metrics, ...)` of one learner.
-        evaluate: `(state, params, key) -> mean return` of one learner.
+        evaluate: `(state, params, key, wanted) -> mean return` of one learner, which is not looked
+            at where `wanted` is false.
         solved_return: Mean return that counts as solved.
 
     Returns:
@@ -276,13 +290,13 @@ def until_solved(step, evaluate, solved_return: float):
     """
 
     def stepped(carry: UntilSolved, params):
-        state, solved, key = carry
+        state, score, solved, key = carry
         new, metrics = step(state, params)[:2]
         state = jax.tree.map(lambda old, n: jnp.where(solved, old, n), state, new)
         key, evaluate_key = jax.random.split(key)
-        score = evaluate(state, params, evaluate_key)
-        solved = solved | (score >= solved_return)
+        score = jnp.where(solved, score, evaluate(state, params, evaluate_key, ~solved))
+        solved = score >= solved_return
         metrics = metrics | {"evaluation": score, "finished": solved}
-        return UntilSolved(state, solved, key), metrics
+        return UntilSolved(state, score, solved, key), metrics
 
     return stepped

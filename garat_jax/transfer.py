@@ -139,14 +139,21 @@ class Experiment:
         """Train policies [seeds] from scratch until each solves a world, and say which did."""
         config, agent = self.config, self.worlds.agent
 
-        def evaluate(state: ActorCriticState, params: Params, key: jax.Array) -> jax.Array:
-            episodes = config.num_solving_episodes
-            returns = rollout.evaluate(world.env, params, agent.policy, state.policy, key, episodes)
+        def evaluate(state: ActorCriticState, params: Params, key: jax.Array, wanted) -> jax.Array:
+            returns = rollout.evaluate(
+                world.env,
+                params,
+                agent.policy,
+                state.policy,
+                key,
+                config.num_solving_episodes,
+                wanted,
+            )
             return returns.mean()
 
         def start(key: jax.Array) -> UntilSolved:
             init_key, key = jax.random.split(key)
-            return UntilSolved(agent.init(init_key, world.params), jnp.zeros((), bool), key)
+            return UntilSolved.start(agent.init(init_key, world.params), key)
 
         step = train.until_solved(agent.step, evaluate, config.pair.task.solved_return)
         return self.train(
@@ -291,7 +298,8 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
     keys = jax.vmap(jax.random.key)(jnp.asarray(trainer.seeds))
     experiment = Experiment(config, trainer, Worlds(source, target, agent), keys)
 
-    source_state, source_solved, _ = experiment.solve("source policy", source)
+    source_learner = experiment.solve("source policy", source)
+    source_state = source_learner.state
     target_state = experiment.solve("target policy", target).state
     recorded = experiment.record(source_state.policy, "target transitions")
     held_out = experiment.record(source_state.policy, "held-out transitions")
@@ -327,7 +335,7 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
         method=config.method,
         seeds=list(trainer.seeds),
         solved_return=task.solved_return,
-        source_solved=np.asarray(source_solved),
+        source_solved=np.asarray(source_learner.solved),
         returns=returns,
         errors=errors,
         curve=[line for line in run.metrics() if line["stage"] == "grounding"],

@@ -9,6 +9,7 @@ import pytest
 
 from garat_jax import rollout
 from garat_jax.dynamics import Override
+from garat_jax.engine import HostModel
 from garat_jax.env import make_world
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from tests.probe_envs import Walk, WalkParams
@@ -109,6 +110,36 @@ def test_evaluate_counts_only_the_first_episode():
     expected = (positions * jnp.cumprod(alive, axis=1)).sum(axis=1)
     np.testing.assert_allclose(returns, expected, rtol=1e-5)
     np.testing.assert_array_equal(alive.sum(axis=1), 2)  # of 6 steps, a new episode after them
+
+
+def test_evaluate_steps_no_episode_beyond_its_end(monkeypatch):
+    steps = []
+    advance = HostModel._advance_batch
+
+    def counted(self, num_substeps, batch, controls, ids):
+        steps.append(len(controls) if ids is None else len(ids))
+        return advance(self, num_substeps, batch, controls, ids)
+
+    monkeypatch.setattr(HostModel, "_advance_batch", counted)
+    world = make_world(InvertedPendulum(), engine="mujoco")
+
+    @partial(jax.jit, static_argnums=1)
+    def evaluate(key, wanted):
+        return rollout.evaluate(world.env, world.params, uniform, (), key, 6, wanted)
+
+    @jax.jit
+    def unroll(key):
+        reset_key, key = jax.random.split(key)
+        start = rollout.reset(world.env, world.params, reset_key, 6)
+        return rollout.unroll(world.env, world.params, uniform, (), start, key, 60)[1]
+
+    keys = jax.random.split(jax.random.key(2))
+    returns = jax.block_until_ready(jax.vmap(lambda key: evaluate(key, True))(keys))
+    assert sum(steps) == returns.sum()  # every step is paid 1
+    transitions = jax.vmap(unroll)(keys)
+    assert transitions.terminated.any(axis=1).all()
+    np.testing.assert_array_equal(returns, 1 + transitions.terminated.argmax(axis=1))
+    np.testing.assert_array_equal(evaluate(keys[0], False), np.zeros(6))
 
 
 @pytest.fixture(scope="module")

@@ -242,9 +242,9 @@ def climber(solved_return: float):
     def step(height, params):
         return height + params, {"height": height + params}, "transitions"
 
-    def evaluate(height, params, key):
+    def evaluate(height, params, key, wanted):
         del params, key
-        return height
+        return jnp.where(wanted, height, 0.0)
 
     return jax.vmap(train.until_solved(step, evaluate, solved_return), (0, None))
 
@@ -252,7 +252,7 @@ def climber(solved_return: float):
 def climbers(*heights: float) -> UntilSolved:
     count = len(heights)
     keys = jax.random.split(jax.random.key(0), count)
-    return UntilSolved(jnp.asarray(heights), jnp.zeros(count, bool), keys)
+    return jax.vmap(UntilSolved.start)(jnp.asarray(heights), keys)
 
 
 def test_a_seed_that_has_solved_its_task_stays_as_it_is(tmp_path):
@@ -262,6 +262,7 @@ def test_a_seed_that_has_solved_its_task_stays_as_it_is(tmp_path):
     assert [line["finished"] for line in lines(loop.run)] == [
         [False, False], [False, True], [True, True],
     ]  # fmt: skip
+    np.testing.assert_array_equal(state.score, [3.0, 3.5])
 
 
 def test_without_a_solution_the_iterations_run_out(tmp_path):
