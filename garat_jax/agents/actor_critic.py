@@ -12,6 +12,7 @@ from garat_jax.agents import advantage
 from garat_jax.env import Env, EnvState
 from garat_jax.networks import GaussianPolicy, ValueNet, forward
 from garat_jax.rollout import Fault
+from garat_jax.shuffle import shuffled
 from garat_jax.types import Params, Policy, Transition
 
 
@@ -154,5 +155,5 @@ def minibatches(batch: Batch, key: jax.Array, num_minibatches: int) -> Batch:
     """Shuffle a batch [N] and cut it into [num_minibatches, N // num_minibatches]."""
     total = batch.action.shape[0]
     size = total // num_minibatches
-    order = jax.random.permutation(key, total)[: size * num_minibatches]
+    order = shuffled(key, total)[: size * num_minibatches]
     return jax.tree.map(lambda x: x[order].reshape(num_minibatches, size, *x.shape[1:]), batch)

@@ -23,6 +23,7 @@ from garat_jax.methods.grounded import (
     decode_action,
 )
 from garat_jax.networks import Discriminator, forward
+from garat_jax.shuffle import shuffled
 from garat_jax.types import Metrics, Params, Policy, Transition
 
 
@@ -167,9 +168,9 @@ class GARAT:
         grounded_key, target_key, penalty_key = jax.random.split(key, 3)
         num = self.config.num_minibatches
         size = grounded.shape[0] // num
-        order = jax.random.permutation(grounded_key, grounded.shape[0])[: num * size]
-        picks = jnp.arange(num * size) % wanted.shape[0]  # each equally often, one pass if alike
-        picks = jax.random.permutation(target_key, picks)
+        order = shuffled(grounded_key, grounded.shape[0])[: num * size]
+        # Each equally often, in one pass if the sizes are alike.
+        picks = shuffled(target_key, num * size) % wanted.shape[0]
         batches = [data.reshape(num, size, -1) for data in (grounded[order], wanted[picks])]
         keys = jax.random.split(penalty_key, num)
 

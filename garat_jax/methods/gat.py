@@ -16,6 +16,7 @@ from garat_jax import rollout
 from garat_jax.env import Env
 from garat_jax.methods.grounded import GroundedEnv
 from garat_jax.networks import MLP, forward
+from garat_jax.shuffle import shuffled
 from garat_jax.types import Metrics, Params, Policy, Transition
 
 
@@ -152,8 +153,8 @@ class GAT:
         config = self.config
         total = config.num_envs * config.num_steps
         num = max(1, total // config.minibatch)
-        picks = jnp.arange(num * config.minibatch) % data.reward.shape[0]
-        picks = jax.random.permutation(key, picks).reshape(num, config.minibatch)
+        picks = shuffled(key, num * config.minibatch) % data.reward.shape[0]
+        picks = picks.reshape(num, config.minibatch)
         return jax.tree.map(lambda x: x[picks], data)
 
     def _learn(self, carry, batches: tuple[Transition, Transition]):

@@ -1,0 +1,28 @@
+"""Random orders for minibatches."""
+
+import jax
+import jax.numpy as jnp
+
+WORD = 32
+MOST = 1 << WORD // 2
+"""Most numbers for which half of a word's bits are left to draw the order."""
+
+
+def shuffled(key: jax.Array, num: int) -> jax.Array:
+    """Return the numbers below `num` in random order, [num] int32.
+
+    Each number is put below random bits in one word, and the words are sorted. On a CPU, where XLA
+    sorts words quickly and pairs slowly, this takes a fraction of the time of
+    `jax.random.permutation`, which sorts pairs of a random key and a number, twice for this many.
+    Numbers that draw the same bits come in ascending order: of 5,000, one in a hundred or so.
+
+    Args:
+        key: PRNG key.
+        num: How many; for more than `MOST` this is `jax.random.permutation`.
+    """
+    if num > MOST:
+        return jax.random.permutation(key, num)
+    num_bits = (num - 1).bit_length()
+    drawn = jax.random.bits(key, (num,), jnp.uint32) >> num_bits << num_bits
+    words = jnp.sort(drawn | jnp.arange(num, dtype=jnp.uint32))
+    return (words & ((1 << num_bits) - 1)).astype(jnp.int32)
