@@ -149,6 +149,7 @@ def test_vmap_over_states_and_parameters_is_a_loop(engine):
     damping = jnp.asarray([0.0, 0.1, 0.5])
     angles = jnp.asarray([0.1, 0.2])
 
+    @jax.jit
     def advance(coefficient, angle):
         changed = world.replace(effects=(world.effects[0].replace(coefficient=coefficient),))
         state = dynamics.initial_state(changed, angle[None], jnp.ones(1))
@@ -166,7 +167,8 @@ def test_set_const_is_what_mujoco_computes(mjcf):
 
     model = spec(mjcf).compile()
     mass = model.body_mass * np.linspace(1.0, 3.0, model.nbody)
-    changed = set_const(mjx.put_model(model).replace(body_mass=jnp.asarray(mass)), model)
+    heavier = mjx.put_model(model).replace(body_mass=jnp.asarray(mass))
+    changed = jax.jit(lambda heavier: set_const(heavier, model))(heavier)
     model.body_mass[:] = mass
     mujoco.mj_setConst(model, mujoco.MjData(model))
     weights = ("dof_invweight0", "body_invweight0", "tendon_invweight0")
