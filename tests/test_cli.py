@@ -75,6 +75,7 @@ def test_version():
         (["compare", "no.xml", "no.csv"], ["MODEL", "there is no file no.xml"]),
         (["compare", __file__], ["DATA", "one file or more"]),
         (["compare", __file__, "no.csv"], ["DATA", "there is no file no.csv"]),
+        (["compare", __file__, "."], ["DATA", ". is a folder; name the files in it"]),
         (["diagnose", __file__, "no.csv"], ["DATA", "there is no file no.csv"]),
         (["diagnose", __file__, __file__, "--holdout", "no.csv"], ["--holdout", "no file no.csv"]),
         (["diagnose", __file__, __file__, "--holdout", __file__], ["test_cli.py is given twice"]),

@@ -92,6 +92,8 @@ def check_files(paths: Sequence[Path], what: str) -> None:
     if not paths:
         raise UserError(f"{what}: expected one file or more")
     for path in paths:
+        if path.is_dir():
+            raise UserError(f"{what}: {path} is a folder; name the files in it")
         if not path.is_file():
             raise UserError(f"{what}: there is no file {path}")
 

@@ -43,8 +43,6 @@ class Add:
         check_files(self.fit or [self.model], "--fit")
         check_optional(self.map, "--map")
         values = dict(_assignment(text) for text in self.set)
-        if not values and not self.fit:
-            raise UserError("an effect needs a size: give --set NAME=VALUE, or --fit DATA")
         check_out(self.out, ".toml", self.force)
         from garat_jax.diagnosis import load_model
         from garat_jax.diagnosis.add import choose_effect, size
@@ -55,6 +53,8 @@ class Add:
 
         model = load_model(self.model, load_catalogue(self.effects))
         effect = choose_effect(model, self.effect, self.at, values)
+        if not values and not self.fit:
+            raise UserError("an effect needs a size: give --set NAME=VALUE, or --fit DATA")
         mjcf_in_card(self.out, model)
         if self.fit:
             recordings = read_recordings(model, self.fit, self.map)

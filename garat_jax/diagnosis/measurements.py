@@ -221,7 +221,10 @@ def _check_columns(table: Table, model: mujoco.MjModel) -> bool:
     _check_actuators(table, commands)
     for name in table.columns:
         if name not in known:
-            raise UserError(f"{table.path}: {unknown_name('column', name, known)}")
+            unknown = unknown_name("column", name, known)
+            raise UserError(
+                f"{table.path}: {unknown} (--map renames columns and leaves others out)"
+            )
     measured = any(name in table.columns for name in velocities)
     for name in ["time", *positions, *commands, *(velocities if measured else [])]:
         if name not in table.columns:

@@ -72,6 +72,7 @@ def test_a_second_effect_keeps_the_first(pendulum):
             ["coulomb_fricton", "--at", "joint/hinge", "--set", "torque=1"],
             "did you mean coulomb_friction",
         ),
+        (["coulomb_fricton", "--at", "joint/hinge"], "did you mean coulomb_friction"),
         (["coulomb_friction", "--at", "joint/hing", "--set", "torque=1"], "did you mean hinge?"),
         (["coulomb_friction", "--at", "hinge", "--set", "torque=1"], "acts on joint/NAME"),
         (["coulomb_friction", "--at", "joint/hinge", "--set", "torqe=1"], "did you mean torque?"),

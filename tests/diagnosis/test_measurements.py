@@ -83,7 +83,9 @@ def test_measured_torque_is_kept(tmp_path):
 
 def test_unknown_column_names_the_nearest(tmp_path):
     path = save(tmp_path, columns(qpos__hing=np.zeros(200), qpos__hinge=None))
-    assert "unknown column 'qpos.hing'; did you mean qpos.hinge" in refusal(path)
+    said = refusal(path)
+    assert "unknown column 'qpos.hing'; did you mean qpos.hinge" in said
+    assert "--map renames columns" in said
 
 
 @pytest.mark.parametrize(
