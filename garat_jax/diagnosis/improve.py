@@ -25,7 +25,7 @@ from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.view import repaired
 from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue
-from garat_jax.report import Reproduce, Section
+from garat_jax.report import Reproduce, Section, Table
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
 
 FORMAT = "garat-improve/1"
@@ -204,10 +204,33 @@ def run_improve(
         title=f"Repair of {loaded.name}",
         lead=diagnosis_lead(done.diagnosis),
         facts=diagnosis_facts(done.diagnosis),
-        sections=[*sections, _card_section(done)],
+        sections=[*sections, _rounds_section(done.rounds), _card_section(done)],
         reproduce=Reproduce.from_config(run.read_json("config.json")),
     )
     return done
+
+
+def _rounds_section(rounds: Sequence[Diagnosis]) -> Section:
+    """Show what each diagnosis found in the model as the one before had left it."""
+    columns = ["diagnosis", "verdict", "adds", "before", "after", "noise floor", "unexplained [%]"]
+    rows = [
+        (
+            number,
+            found.verdict.replace("_", " "),
+            ", ".join(str(c.named) for c in found.selected) or "nothing",
+            found.error.before,
+            found.error.after,
+            found.error.noise_floor,
+            round(100 * found.error.unexplained_share),
+        )
+        for number, found in enumerate(rounds, 1)
+    ]
+    text = (
+        "Each diagnosis begins with what the ones before it added. A better model predicts for "
+        "longer, so later ones may follow the recordings over longer segments: held-out errors "
+        "compare along a row, not down a column."
+    )
+    return Section("Diagnosis after diagnosis", text, tables=[Table(columns, rows)])
 
 
 def _card_section(done: Improvement) -> Section:

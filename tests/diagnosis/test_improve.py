@@ -1,6 +1,7 @@
 """`garat improve`: a hidden effect ends up in a model card that loads, and the error falls."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,9 @@ def test_the_report_says_what_was_done(improved):
     page = Path(improved[1].root / "report.html").read_text()
     for part in ("Repair of pendulum", "The same in every recording?", "The repaired model"):
         assert part in page
+    shown = re.sub(r"<[^>]*>", " ", page.split("Diagnosis after diagnosis</h2>")[1])
+    for row in (r"1\s+missing effect\s+coulomb_friction at joint/hinge", r"2\s+adequate\s+nothing"):
+        assert re.search(row, shown)
     assert "A last diagnosis of the repaired model found it adequate." in page
 
 
