@@ -105,6 +105,11 @@ class Env(abc.ABC):
     ) -> StepResult:
         """Take one control step with an action [action_size], which is clipped."""
 
+    def idle(self, params: Params, state: EnvState) -> EnvState:
+        """Return a state whose next step costs as little as it can, for nobody looks at it."""
+        del params
+        return state
+
 
 class TaskEnv(Env):
     """A task on physics: the world that agents act in; `params` are its `Dynamics`.
@@ -141,6 +146,12 @@ class TaskEnv(Env):
         truncated = (steps >= self.episode_length) & ~terminated
         after = EnvState(physics, self._observe(params, physics), steps)
         return StepResult(after, reward, terminated, truncated)
+
+    def idle(self, params: Dynamics, state: EnvState) -> EnvState:
+        """Return a state that is not finite, which C MuJoCo does not step; MJX steps every one."""
+        if params.engine != "mujoco":
+            return state
+        return state._replace(physics=state.physics._replace(time=jnp.full((), jnp.nan)))
 
     def _observe(self, params: Dynamics, physics: PhysicsState) -> jax.Array:
         """Return the observation [obs_size] of what the sensors report."""

@@ -78,10 +78,16 @@ def _step(env: Env, params: Params, policy: Policy, policy_params: Params, state
     fresh = jax.vmap(env.reset, (None, 0))(params, reset_keys)
     done = terminated | truncated
 
-    def select(new: jax.Array, old: jax.Array) -> jax.Array:
-        return jnp.where(done.reshape(done.shape + (1,) * (new.ndim - 1)), new, old)
+    return _select(done, fresh, result.state), transition, (faulty, action, result.state)
 
-    return jax.tree.map(select, fresh, result.state), transition, (faulty, action, result.state)
+
+def _select(chosen: jax.Array, these: EnvState, others: EnvState) -> EnvState:
+    """Return these environments [B] where chosen, else the others."""
+
+    def select(this: jax.Array, other: jax.Array) -> jax.Array:
+        return jnp.where(chosen.reshape(chosen.shape + (1,) * (this.ndim - 1)), this, other)
+
+    return jax.tree.map(select, these, others)
 
 
 def _is_sound(values) -> jax.Array:
@@ -169,7 +175,7 @@ def evaluate(
 ) -> jax.Array:
     """Return undiscounted returns [num_episodes] of whole episodes; stop when all have ended.
 
-    An episode that is over costs no physics while others last.
+    An episode that is over idles while others last; see `Env.idle`.
 
     Args:
         env: The environment.
@@ -190,7 +196,8 @@ def evaluate(
     def step(carry):
         length, _, state, alive, total = carry
         key = keys[length]
-        state = state._replace(physics=_only(alive, state.physics))
+        idle = jax.vmap(env.idle, (None, 0))(params, state)
+        state = _select(alive, state, idle)
         state, transition, _ = _step(env, params, policy, policy_params, state, key, shares)
         total = total + alive * transition.reward
         alive = alive & ~(transition.terminated | transition.truncated)
@@ -201,19 +208,8 @@ def evaluate(
     state = split.own_share(reset(env, params, reset_key, num_episodes), shares)
     wanted = jnp.asarray(wanted)
     alive, total = jnp.full(state.steps.shape, wanted), jnp.zeros(state.steps.shape)
-    carry = (0, wanted, state, alive, total)
+    carry = (0, split.anywhere(wanted), state, alive, total)
     return split.join(jax.lax.while_loop(is_unfinished, step, carry)[4], shares)
-
-
-def _only(chosen: jax.Array, physics):
-    """Leave out of the next step physics [B] not chosen: C MuJoCo skips states that are NaN."""
-
-    def select(x: jax.Array) -> jax.Array:
-        if not jnp.issubdtype(x.dtype, jnp.floating):
-            return x
-        return jnp.where(chosen.reshape(chosen.shape + (1,) * (x.ndim - 1)), x, jnp.nan)
-
-    return jax.tree.map(select, physics)
 
 
 def replay(env: Env, params: Params, recorded: Recorded, key: jax.Array) -> jax.Array:

@@ -123,7 +123,8 @@ def test_evaluate_steps_no_episode_beyond_its_end(monkeypatch):
     monkeypatch.setattr(HostModel, "_advance_batch", counted)
     world = make_world(InvertedPendulum(), engine="mujoco")
 
-    @partial(jax.jit, static_argnums=1)
+    @jax.jit
+    @jax.vmap
     def evaluate(key, wanted):
         return rollout.evaluate(world.env, world.params, uniform, (), key, 6, wanted)
 
@@ -134,12 +135,15 @@ def test_evaluate_steps_no_episode_beyond_its_end(monkeypatch):
         return rollout.unroll(world.env, world.params, uniform, (), start, key, 60)[1]
 
     keys = jax.random.split(jax.random.key(2))
-    returns = jax.block_until_ready(jax.vmap(lambda key: evaluate(key, True))(keys))
+    returns = jax.block_until_ready(evaluate(keys, jnp.asarray([True, True])))
     assert sum(steps) == returns.sum()  # every step is paid 1
+    steps.clear()
+    one = jax.block_until_ready(evaluate(keys, jnp.asarray([False, True])))
+    np.testing.assert_array_equal(one, [np.zeros(6), returns[1]])
+    assert sum(steps) == one.sum()
     transitions = jax.vmap(unroll)(keys)
     assert transitions.terminated.any(axis=1).all()
     np.testing.assert_array_equal(returns, 1 + transitions.terminated.argmax(axis=1))
-    np.testing.assert_array_equal(evaluate(keys[0], False), np.zeros(6))
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,8 @@ world = make_world(InvertedPendulum(), engine=engine)
 agent = ppo.make(world.env, ppo.PPOConfig(num_envs=8, num_steps=20, hidden=(8,)))
 keys = jax.vmap(jax.random.key)(jnp.arange(num_seeds))
 
-def evaluate(policy, key):
-    return rollout.evaluate(world.env, world.params, agent.policy, policy, key, 6)
+def evaluate(policy, key, wanted):
+    return rollout.evaluate(world.env, world.params, agent.policy, policy, key, 6, wanted)
 
 def train(name, mesh):
     run = RunDirectory.create(f"{folder}/{name}", {}, "test", range(num_seeds))
@@ -36,7 +36,9 @@ def train(name, mesh):
     start = trainer.call(init, keys)
     step = split.over_seeds(lambda s, p: agent.step(s, p)[:2], (0, None), mesh)
     state = trainer.train("stage", step, start, world.params, 3)
-    returns = trainer.call(split.over_seeds(evaluate, (0, 0), mesh), state.policy, keys)
+    evaluated = split.over_seeds(evaluate, (0, 0, 0), mesh)
+    wanted = jnp.arange(num_seeds) % 2 == 0
+    returns = [trainer.call(evaluated, state.policy, keys, w) for w in (wanted, ~wanted)]
     return state._replace(key=jax.random.key_data(state.key)), returns
 
 mesh = split.make_mesh(num_seeds, 8)
