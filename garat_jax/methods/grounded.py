@@ -57,10 +57,6 @@ class GroundedEnv(Env):
         action = self.transform(params.transformer, state.obs, self.env.clip(action), transform_key)
         return self.env.step(params.env, state, action, key)
 
-    def idle(self, params: Grounding, state: EnvState) -> EnvState:
-        """Let the environment idle."""
-        return self.env.idle(params.env, state)
-
 
 class TransformerParams(NamedTuple):
     """Parameters of a `TransformerEnv`: the environment's, the fixed agent's, the reward's."""
@@ -123,10 +119,6 @@ class TransformerEnv(Env):
         reward = self.reward(params.reward, obs, wanted, result.state.obs)
         after = self._with_action(params, result.state, agent_key)
         return result._replace(state=after, reward=reward)
-
-    def idle(self, params: TransformerParams, state: EnvState) -> EnvState:
-        """Let the environment idle."""
-        return self.env.idle(params.env, state)
 
 
 def decode_action(
