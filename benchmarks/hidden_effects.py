@@ -1,8 +1,10 @@
 """Hide effects in seven robots and see what the diagnosis finds; or time it beside mujoco.sysid.
 
 `python benchmarks/hidden_effects.py --seed 1` makes the numbers that are reported. Thresholds are
-tuned on seed 0. Rows are appended to OUT/rows.jsonl as they come, so an interrupted run goes on; a
-run of some of the cases writes no result. `--timing` needs `pip install 'mujoco[sysid]'`.
+tuned on seed 0. Rows are appended to OUT/rows.jsonl as they come, so an interrupted run goes on.
+`--sample N` diagnoses the first N sets of a random order; the result says of how many, and a larger
+sample with `--extend` keeps what the result file has. A run of hand-picked cases writes no result.
+`--timing` needs `pip install 'mujoco[sysid]'`.
 """
 
 import argparse
@@ -17,16 +19,19 @@ from pathlib import Path
 from typing import Any
 
 from hidden import score
-from hidden.generate import Case, Surveys, Truth, draw, generate, list_cases
+from hidden.generate import Case, Surveys, Truth, draw, generate, list_cases, shuffled
 from hidden.robots import ROBOTS
-from record import command_line, write_result
+from record import RESULTS, command_line, write_result
 
 from garat_jax.diagnosis import diagnose, load_model
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE
+from garat_jax.provenance import git_state
 from garat_jax.runs import finite_or_null, to_plain
 
+NAME = "hidden_effects"
+"""Of the result file."""
 REPORTING_SEED = 1
 """The seed that is reported; never used to choose a threshold."""
 
@@ -90,9 +95,24 @@ def read_rows(path: Path) -> dict[str, dict[str, Any]]:
     return {row["case"]: row for row in rows if row["status"] == "done"}
 
 
-def run(cases: list[Case], robots: Sequence[str], jobs: int, path: Path) -> list[dict[str, Any]]:
-    """Run all cases that are not in the file yet, append them to it, and return all rows."""
-    earlier = read_rows(path)
+def recorded_rows(seed: int) -> dict[str, dict[str, Any]]:
+    """Return the rows of the result file that come from this seed, by case."""
+    path = RESULTS / f"{NAME}.json"
+    if not path.exists():
+        return {}
+    rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
+    return {row["case"]: row for row in rows if row["seed"] == seed and row["status"] == "done"}
+
+
+def run(
+    cases: list[Case],
+    robots: Sequence[str],
+    jobs: int,
+    path: Path,
+    earlier: dict[str, dict[str, Any]],
+) -> list[dict[str, Any]]:
+    """Run all cases that have no earlier row, append them to a file, and return all rows."""
+    commit = (git_state() or {}).get("commit")
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = [earlier[case.name] for case in cases if case.name in earlier]
     todo = [case for case in cases if case.name not in earlier]
@@ -105,6 +125,7 @@ def run(cases: list[Case], robots: Sequence[str], jobs: int, path: Path) -> list
             else (run_case(case, robots) for case in todo)
         )
         for row in made:
+            row["commit"] = commit
             rows.append(row)
             say(row)
             with path.open("a", encoding="utf-8") as file:
@@ -121,6 +142,8 @@ def report(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         text = f"{line['measure']}: {'–' if value is None else f'{value:.3g}'}"
         if "count" in line:
             text += f" of {line['count']}"
+        if "interval" in line:
+            text += " (95 % interval {:.2f}–{:.2f})".format(*line["interval"])
         if "target" in line:
             text += f", target {line['target']}: {'met' if line['met'] else 'falls short'}"
         print(text)
@@ -134,7 +157,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=REPORTING_SEED, help="tune on 0, report on 1")
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="cases whose name holds a text")
     parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
-    parser.add_argument("--limit", type=int, help="only so many cases, evenly over all")
+    parser.add_argument("--sample", type=int, metavar="N", help="the first N of a random order")
+    parser.add_argument("--extend", action="store_true", help="keep the rows of the result file")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder of rows.jsonl")
     parser.add_argument("--timing", action="store_true", help="time garat beside mujoco.sysid")
@@ -143,23 +167,22 @@ def main() -> None:
     if arguments.timing:
         from hidden import timing
 
-        print(
-            write_result("hidden_effects_timing", timing.measure_all(), seeds=[], command=command)
-        )
+        print(write_result(f"{NAME}_timing", timing.measure_all(), seeds=[], command=command))
         return
-    cases = list_cases(arguments.seed)
+    cases = shuffled(list_cases(arguments.seed), arguments.seed)
     num_cases = len(cases)
     if arguments.only:
         cases = [c for c in cases if any(text in c.name for text in arguments.only)]
-    if arguments.limit:
-        cases = cases[:: max(1, len(cases) // arguments.limit)][: arguments.limit]
-    out = arguments.out or Path("runs") / f"hidden_effects-{arguments.seed}"
-    rows = run(cases, arguments.robots, arguments.jobs, out / "rows.jsonl")
+    cases = cases[: arguments.sample]
+    path = (arguments.out or Path("runs") / f"{NAME}-{arguments.seed}") / "rows.jsonl"
+    earlier = recorded_rows(arguments.seed) if arguments.extend else {}
+    rows = run(cases, arguments.robots, arguments.jobs, path, earlier | read_rows(path))
     lines = report(rows)
-    whole = len(rows) == num_cases and arguments.robots == list(ROBOTS)
-    if whole and not any(row["status"] == score.NOT_YET for row in rows):
-        result = [{"table": lines}, *rows]
-        print(write_result("hidden_effects", result, seeds=[arguments.seed], command=command))
+    picked = arguments.only or arguments.robots != list(ROBOTS)
+    if not picked and not any(row["status"] == score.NOT_YET for row in rows):
+        details = {"cases": num_cases, "sample": len(rows), "table": lines}
+        seeds = [arguments.seed]
+        print(write_result(NAME, rows, seeds=seeds, command=command, details=details))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from benchmarks.hidden.bodies import CATALOGUED, SECRETS
-from benchmarks.hidden.generate import Case, Surveys, Truth, add_noise, draw, generate, list_cases
+from benchmarks.hidden.generate import (
+    Case,
+    Surveys,
+    Truth,
+    add_noise,
+    draw,
+    generate,
+    list_cases,
+    shuffled,
+)
 from benchmarks.hidden.measure import experiment, measure
 from benchmarks.hidden.robots import ROBOTS
 from benchmarks.hidden.score import NOT_YET, aggregate, score
@@ -54,6 +63,18 @@ def test_the_list_has_every_kind_at_three_sizes_pairs_clean_ones_and_outsiders()
     assert counts == [20, 20, 20]
     assert {c.kinds[0] for c in cases if c.category == "outside"} == set(OUTSIDE)
     assert list_cases(0) == cases != list_cases(1)
+
+
+def test_every_beginning_of_the_random_order_has_each_category_in_its_share():
+    cases = list_cases(1)
+    order = shuffled(cases, 1)
+    assert sorted(order) == sorted(cases) and order != cases
+    assert order == shuffled(cases, 1)
+    for sample in (20, 50, 100):
+        for name in ("single", "pair", "clean", "outside"):
+            share = sum(case.category == name for case in cases) / len(cases)
+            count = sum(case.category == name for case in order[:sample])
+            assert abs(count - sample * share) <= 3
 
 
 @pytest.mark.parametrize("kind", SECRETS)

@@ -109,6 +109,20 @@ def list_cases(seed: int) -> list[Case]:
     return [Case(*row, (seed, index + 1)) for index, row in enumerate(planned)]
 
 
+def shuffled(cases: Sequence[Case], seed: int) -> list[Case]:
+    """Return cases in a random order, each category and size in its share of every beginning."""
+    rng = np.random.default_rng([seed, 1])
+    groups: dict[tuple[str, str], list[Case]] = {}
+    for case in cases:
+        groups.setdefault((case.category, case.size), []).append(case)
+    turns = [
+        ((turn + rng.random()) / len(group), case)
+        for group in groups.values()
+        for turn, case in enumerate(group[i] for i in rng.permutation(len(group)))
+    ]
+    return [case for _, case in sorted(turns)]
+
+
 ROOMS = (
     ("viscous_damping", "coulomb_friction", "stribeck_friction", "asymmetric_friction"),
     ("motor_gain", "torque_saturation", "motor_deadband", "motor_curve"),

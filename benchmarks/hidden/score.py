@@ -7,6 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy import stats
 
 from garat_jax.diagnosis import Diagnosis, Model, Recording
 from garat_jax.diagnosis.diagnose import split, thin
@@ -228,10 +229,16 @@ CATEGORIES = ("single", "pair", "clean", "outside")
 
 
 def _share(measure: str, rows, key: str, low: float | None, high: float = 1.0) -> dict[str, Any]:
-    """Return the share of rows that have it; rows that failed with an error do not."""
-    count = len(rows)
-    value = sum(bool(row.get(key)) for row in rows) / count if count else None
+    """Return the share of rows that have it, with Wilson's 95 % interval.
+
+    Rows that failed with an error do not have it.
+    """
+    count, having = len(rows), sum(bool(row.get(key)) for row in rows)
+    value = having / count if count else None
     line: dict[str, Any] = {"measure": measure, "value": value, "count": count}
+    if count:
+        sure = stats.binomtest(having, count).proportion_ci(method="wilson")
+        line["interval"] = [float(sure.low), float(sure.high)]
     if low is not None:
         line |= {"target": [low, high], "met": value is not None and low <= value <= high}
         line["short"] = sorted({row["case"] for row in rows if not row.get(key)})
