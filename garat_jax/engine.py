@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import hashlib
+import logging
 import threading
 from collections.abc import Iterator
 
@@ -20,6 +21,11 @@ STATE_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")
 KEPT_BATCHES = 16
 """Batches of simulations, of all models together, that are kept for the next call."""
 INPUTS = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
+
+_log = logging.getLogger(__name__)
+# MuJoCo would print each warning and append it to MUJOCO_LOG.TXT in the current folder. Callers see
+# states that are not finite, and say so in words of their own.
+mujoco.set_mju_user_warning(_log.debug)
 
 _idle: list[tuple[tuple, Batch]] = []
 """Simulations that no call uses now, those used last at the end; scratch space without a state."""

@@ -1,6 +1,7 @@
 """The two engines are one physics, and overrides and effects reach both."""
 
 import functools
+import logging
 
 import jax
 import jax.numpy as jnp
@@ -265,6 +266,19 @@ def test_a_bad_state_stays_bad_in_both_engines():
         world = compiled(PENDULUM, engine=engine)
         state = dynamics.initial_state(world, jnp.full(1, jnp.nan), jnp.zeros(1))
         assert np.isnan(dynamics.step(world, state, jnp.zeros(1)).qpos).all()
+
+
+def test_a_simulation_that_diverges_prints_nothing_and_leaves_no_file(
+    tmp_path, monkeypatch, capfd, caplog
+):
+    monkeypatch.chdir(tmp_path)
+    caplog.set_level(logging.DEBUG, "garat_jax.engine")
+    world = compiled(PENDULUM, engine="mujoco")
+    state = dynamics.initial_state(world, jnp.zeros(1), jnp.full(1, 1e20))
+    dynamics.step(world, state, jnp.zeros(1), 4).qvel.block_until_ready()
+    assert "unstable" in caplog.text
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_native_model_is_what_the_engine_steps():
