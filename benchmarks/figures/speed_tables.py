@@ -14,6 +14,7 @@ WORLDS = {
     "minitaur": "Minitaur",
 }
 """Names of environments, in the order of the columns."""
+ENGINES = {"mujoco": "C MuJoCo", "mjx": "MJX"}
 ALGORITHMS = {"trpo": "TRPO", "ppo": "PPO"}
 PARTS = {
     "rollout": "rollout",
@@ -93,6 +94,43 @@ def _parts(result: dict[str, Any]) -> str:
         for cost in costs
     ]
     return table(("ms in an iteration", *PARTS.values(), "whole iteration"), rows)
+
+
+def learning() -> str:
+    return if_measured(_learning, "learning")
+
+
+def _learning(result: dict[str, Any]) -> str:
+    """One row a world and agent: mean returns at each point of the training."""
+    lines = [
+        (
+            f"{WORLDS[row['env']]}, {row['agent']}",
+            *(f"{sum(returns) / len(returns):,.0f}" for returns in row["returns"][:-1]),
+            f"**{row['mean']:,.0f} ± {row['standard_error']:,.0f}**",
+        )
+        for name in dict.fromkeys(row["env"] for row in result["rows"])
+        for row in result["rows"]
+        if row["env"] == name
+    ]
+    steps = [f"{steps:,} steps" for steps in result["rows"][0]["steps"]]
+    return table(("mean return", *steps), lines)
+
+
+def start() -> str:
+    return if_measured(_start, "start")
+
+
+def _start(result: dict[str, Any]) -> str:
+    """One row an engine: seconds from the command to the first update, without and with a cache."""
+    lines = [
+        (
+            ENGINES[row["engine"]],
+            f"{row['cold_seconds']:.1f}",
+            f"{row['warm_seconds']:.1f}",
+        )
+        for row in result["rows"]
+    ]
+    return table(("engine", "empty cache, s", "second start, s"), lines)
 
 
 def growth() -> str:

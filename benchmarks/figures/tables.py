@@ -88,7 +88,7 @@ def flags() -> str:
     rows = [
         (
             row["model"].replace("_", " "),
-            {"mujoco": "C MuJoCo", "mjx": "MJX"}[row["engine"]],
+            speed_tables.ENGINES[row["engine"]],
             emitters[row["fusion_emitters"]],
             f"{row['steps_per_second']:,.0f}",
             f"{row['compile_processor_seconds']:.1f}",
@@ -113,6 +113,41 @@ def optimisation_level() -> str:
     ]
     columns = ("pair", "agent", "level", "compilation, s", "an iteration, s")
     return table(columns, rows) + origin("optimisation_level", result)
+
+
+def hidden_effects() -> str:
+    return speed_tables.if_measured(_hidden_effects, "hidden_effects")
+
+
+def _hidden_effects(result: dict[str, Any]) -> str:
+    """One row a measure, beside what it is held to."""
+    lines = []
+    for line in result["table"]:
+        if line.get("interval") is None:
+            continue
+        target = line.get("target")
+        low, high = line["interval"]
+        lines.append(
+            (
+                line["measure"],
+                f"{100 * line['value']:.0f} %",
+                f"{100 * low:.0f}–{100 * high:.0f} %",
+                str(line["count"]),
+                "" if target is None else _span(*target),
+            )
+        )
+    seconds = next(line for line in result["table"] if line["measure"] == "seconds a set")
+    text = (
+        f"\n{result['sample']} of {result['cases']} sets of recordings, seed "
+        f"{result['seeds'][0]}; a set took {seconds['value']:.0f} s (median), at most "
+        f"{seconds['largest']:.0f} s. The result file names the sets that fall short.\n"
+    )
+    columns = ("measure", "share", "95 % interval", "of", "held to")
+    return table(columns, lines) + text
+
+
+def _span(low: float, high: float) -> str:
+    return f"≥ {100 * low:.0f} %" if high == 1 else f"{100 * low:.0f}–{100 * high:.0f} %"
 
 
 def real_data() -> str:
@@ -199,12 +234,15 @@ TABLES: dict[str, Callable[[], str]] = {
     "variants": variants,
     "throughput": speed_tables.throughput,
     "parts": speed_tables.parts,
+    "learning": speed_tables.learning,
+    "start": speed_tables.start,
     "growth": speed_tables.growth,
     "seeds_together": speed_tables.seeds_together,
     "memory": speed_tables.memory,
     "flags": flags,
     "fidelity": fidelity,
     "optimisation_level": optimisation_level,
+    "hidden_effects": hidden_effects,
     "real_data": real_data,
     "ground": ground,
 }

@@ -98,14 +98,14 @@ class Choice(NamedTuple):
     num_threads: int
 
 
-def make_envs(env_name: str, world: World, stepped: str, num_envs: int) -> VecEnv:
+def make_envs(env_name: str, world: World, num_envs: int, stepped: str = VECTOR) -> VecEnv:
     """Make the environments that a peer learns in."""
     if stepped == VECTOR:
         return VectorForBaselines(to_gymnasium_vector(world.env, world.params, num_envs))
     return DummyVecEnv([lambda: make(GYMNASIUM[env_name])] * num_envs)
 
 
-def make_trpo(envs: VecEnv) -> TRPO:
+def make_trpo(envs: VecEnv, seed: int = 0) -> TRPO:
     """Build sb3-contrib's TRPO with the hyper-parameters of ours.
 
     Ours normalises observations on top, which would cost the peer time, and leaves out the value's
@@ -129,7 +129,7 @@ def make_trpo(envs: VecEnv) -> TRPO:
         n_critic_updates=config.value_epochs,
         target_kl=config.max_kl,
         policy_kwargs=_networks(config.hidden, config.initial_log_std),
-        seed=0,
+        seed=seed,
         device="cpu",
     )
 
@@ -187,7 +187,7 @@ def sides(
     tried: list[dict[str, Any]] = []
     learners: dict[tuple[str, Choice], Any] = {}
     for stepped, num_envs in _sizes(env_name):
-        envs = make_envs(env_name, world, stepped, num_envs)
+        envs = make_envs(env_name, world, num_envs, stepped)
         for algorithm in algorithms:
             library, make_learner = LEARNERS[algorithm]
             with warnings.catch_warnings():  # advice on batch sizes and on GPUs

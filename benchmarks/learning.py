@@ -1,0 +1,172 @@
+"""Measure what TRPO learns in a million steps, beside sb3-contrib's TRPO in the same worlds.
+
+`python benchmarks/learning.py`: five seeds of each with the same hyper-parameters; mean returns of
+the policies' mean actions over 50 whole episodes, at four points of the training. The peer's
+observations are normalised like ours, which it leaves to its user. Its seeds run in `--jobs`
+processes.
+"""
+
+# pyright: reportMissingImports=false
+import concurrent.futures
+import dataclasses
+import importlib.metadata
+import multiprocessing
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from record import RESULTS, command_line, write_result
+
+from garat_jax import rollout
+from garat_jax.agents import trpo
+from garat_jax.agents.trpo import TRPOConfig
+from garat_jax.compiler_options import compiler_options
+from garat_jax.env import World, make_world
+from garat_jax.envs import ENVS
+
+POINTS = 4
+"""How often in the training the policies are evaluated, evenly."""
+EPISODES = 50
+WITHIN = 0.1
+"""Ours may lie below the peer's mean return by this share of it."""
+OURS, PEER = "garat_jax trpo", "sb3-contrib trpo"
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Measure what TRPO learns, beside sb3-contrib's."""
+
+    envs: tuple[str, ...] = ("inverted_pendulum", "hopper", "half_cheetah", "walker2d")
+    """The environments."""
+    steps: int = 1_000_000
+    """Environment steps of each seed."""
+    seeds: int = 5
+    """How many seeds."""
+    jobs: int = 2
+    """Processes for the peer's seeds."""
+    out: Path = RESULTS
+    """Folder for the results."""
+
+
+def host_world(name: str) -> World:
+    return make_world(ENVS[name](), engine="mujoco")
+
+
+def learn(name: str, seeds: int, steps: int) -> np.ndarray:
+    """Train ours; return mean returns [points, seeds]."""
+    world = host_world(name)
+    agent = trpo.make(world.env, TRPOConfig())
+    options = compiler_options(world.params)
+
+    def acting(params, obs: jax.Array, key: jax.Array):
+        del key
+        return agent.mean(params, obs), jnp.zeros(())
+
+    def evaluate(state, key: jax.Array) -> jax.Array:
+        returns = rollout.evaluate(world.env, world.params, acting, state.policy, key, EPISODES)
+        return returns.mean()
+
+    def iterate(state):
+        return jax.vmap(agent.step, (0, None))(state, world.params)[0]
+
+    keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+    state = jax.jit(jax.vmap(agent.init, (0, None)), compiler_options=options)(keys, world.params)
+    step = jax.jit(iterate, compiler_options=options)
+    score = jax.jit(jax.vmap(evaluate), compiler_options=options)
+    found = []
+    for point in range(POINTS):
+        for _ in range(steps // POINTS // agent.steps_per_iteration):
+            state = step(state)
+        evaluation_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, point)
+        found.append(np.asarray(score(state, evaluation_keys)))
+    return np.asarray(found)
+
+
+def learn_peer(name: str, seed: int, steps: int) -> list[float]:
+    """Train one seed of the peer; return its mean returns [points]."""
+    import torch
+    from speed.torch_peers import make_envs, make_trpo
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from garat_jax.adapters import to_gymnasium_vector
+
+    torch.set_num_threads(1)
+    world = host_world(name)
+    num_envs = TRPOConfig().num_envs
+    envs = VecNormalize(make_envs(name, world, num_envs=num_envs), norm_reward=False)
+    with warnings.catch_warnings():  # advice on batch sizes
+        warnings.simplefilter("ignore")
+        learner = make_trpo(envs, seed)
+    judges = to_gymnasium_vector(world.env, world.params, EPISODES)
+    found = []
+    for _ in range(POINTS):
+        learner.learn(steps // POINTS, log_interval=None, reset_num_timesteps=False)
+        obs, _ = judges.reset(seed=10_000 + EPISODES * seed)
+        alive, total = np.ones(EPISODES, bool), np.zeros(EPISODES)
+        while alive.any():
+            action, _ = learner.predict(envs.normalize_obs(obs), deterministic=True)
+            obs, reward, terminated, truncated, _ = judges.step(action)
+            total += alive * reward
+            alive &= ~(terminated | truncated)
+        found.append(float(total.mean()))
+    return found
+
+
+def row_of(name: str, agent: str, returns: np.ndarray, steps: int) -> dict[str, Any]:
+    """Return a row from mean returns [points, seeds]."""
+    return {
+        "env": name,
+        "agent": agent,
+        "steps": [steps * (point + 1) // POINTS for point in range(POINTS)],
+        "returns": returns.tolist(),
+        "mean": float(returns[-1].mean()),
+        "standard_error": float(returns[-1].std(ddof=1) / np.sqrt(returns.shape[1])),
+        "solved_return": ENVS[name]().solved_return,
+    }
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments)
+    rows = []
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(arguments.jobs, mp_context=context) as pool:
+        futures = {
+            name: [
+                pool.submit(learn_peer, name, seed, arguments.steps)
+                for seed in range(arguments.seeds)
+            ]
+            for name in arguments.envs
+        }
+        for name in arguments.envs:
+            peer = np.asarray([future.result() for future in futures[name]]).T
+            rows.append(row_of(name, PEER, peer, arguments.steps))
+            print(rows[-1], flush=True)
+    for name in arguments.envs:
+        ours = row_of(name, OURS, learn(name, arguments.seeds, arguments.steps), arguments.steps)
+        theirs = next(row for row in rows if row["env"] == name)
+        ours["met"] = ours["mean"] >= theirs["mean"] - WITHIN * abs(theirs["mean"])
+        rows.append(ours)
+        print(ours, flush=True)
+    details = {
+        "peer": {k: importlib.metadata.version(k) for k in ("sb3-contrib", "torch")},
+        "within": WITHIN,
+        "episodes": EPISODES,
+    }
+    print(
+        write_result(
+            "learning",
+            rows,
+            seeds=list(range(arguments.seeds)),
+            command=command_line(),
+            details=details,
+            folder=arguments.out,
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()
