@@ -233,6 +233,9 @@ def test_scores_count_kind_place_and_intervals():
     delayed = dataclasses.replace(truth, delay=0.02)
     assert scored(delayed, candidate("actuator_delay", "all"), right_one())["ok"]
     assert not scored(truth, candidate("actuator_delay", "all"), right_one())["ok"]
+    same = candidate("sensor_delay", "all", [("actuator_delay", "all")])
+    assert scored(delayed, same, right_one())["ok"]
+    assert not scored(delayed, candidate("sensor_delay", "all"), right_one())["ok"]
     clean = dataclasses.replace(truth, case=case._replace(category="clean"), secrets=())
     assert not scored(clean, right_one())["ok"] and scored(clean)["ok"]
 

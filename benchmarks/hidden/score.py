@@ -20,7 +20,7 @@ from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE
 
-from .generate import Truth
+from .generate import TIMINGS, Truth
 from .secrets import Secret
 
 DELAY = "actuator_delay"
@@ -79,11 +79,16 @@ def finds(candidate: Candidate, secret: Secret, model: mujoco.MjModel) -> bool:
 def score(found: Diagnosis, truth: Truth, model: mujoco.MjModel) -> dict[str, Any]:
     """Return what of a set's truth was found.
 
-    Where all commands were late as a nuisance, naming a delay is right and is left out here.
+    Where all commands were late as a nuisance, naming a delay, or what recordings cannot tell from
+    it, is right and is left out here.
     """
-    nuisance = (DELAY,) if truth.delay > 0 else ()
-    selected = [c for c in found.selected if c.effect not in nuisance]
-    ranked = [*selected, *(c for c in found.candidates if c.effect not in nuisance)]
+
+    def is_nuisance(candidate: Candidate) -> bool:
+        is_timing = truth.delay > 0 and candidate.effect in TIMINGS
+        return is_timing and any(named.effect == DELAY for named in names(candidate))
+
+    selected = [c for c in found.selected if not is_nuisance(c)]
+    ranked = [*selected, *(c for c in found.candidates if not is_nuisance(c))]
     first = ranked[0] if ranked else None
     row: dict[str, Any] = {
         "verdict": found.verdict,

@@ -17,6 +17,8 @@ from garat_jax.diagnosis.simulate import columns_of
 
 CONTENDERS = 4
 """How many candidates are fitted each round, besides those that are like the first."""
+SAME = 1.0 - 1e-9
+"""Cosine of two candidates' changes from which they are one change."""
 HOPELESS = 8.0
 """What a candidate is expected to leave unexplained, relative to what the best one left when it was
 fitted, above which it is not fitted; the runner-up always is."""
@@ -57,6 +59,10 @@ def fit_contenders(
     chosen += [s for s in likely[CONTENDERS:] if cosine(s, likely[0]) > EQUIVALENT]
     contenders: list[Contender] = []
     for score in chosen:
+        twin = next((c for c in contenders if _is_same(problem, score, c.score)), None)
+        if twin is not None:
+            contenders.append(_renamed(problem, current, twin, score))
+            continue
         rival = min((c.fit.cost[problem.fitted].sum() for c in contenders), default=np.inf)
         hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
@@ -64,6 +70,29 @@ def fit_contenders(
             continue
         contenders.append(_fit(problem, current, score, rival, say))
     return contenders
+
+
+def _is_same(problem: Problem, one: Score, other: Score) -> bool:
+    """Say whether two candidates are one change with two names.
+
+    Two geoms that touch nothing but each other have the same contacts.
+    """
+    kinds = {problem.simulator.effects[score.effect].kind for score in (one, other)}
+    return len(kinds) == 1 and cosine(one, other) > SAME and np.allclose(one.size, other.size)
+
+
+def _renamed(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender:
+    """Return a contender's fit as that of the same change under another name."""
+    slots = problem.simulator.slots
+    names = columns_of(slots, score.effect)
+    column = {j: names[slots[j].parameter.name] for j in twin.score.columns}
+    theta = np.array(twin.fit.theta)
+    theta[list(twin.score.columns)] = current.theta[list(twin.score.columns)]
+    theta[list(column.values())] = twin.fit.theta[list(column)]
+    free = tuple(column.get(j, j) for j in twin.fit.free)
+    frozen = tuple(column.get(j, j) for j in twin.fit.frozen)
+    renamed = dataclasses.replace(twin.fit, theta=theta, free=free, frozen=frozen)
+    return Contender(score, renamed)
 
 
 def fit_refinements(

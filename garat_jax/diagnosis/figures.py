@@ -203,32 +203,43 @@ def missing_torques(
 
 
 def ranking(candidates: Sequence[Candidate]) -> go.Figure:
-    """Draw by how much each fitted candidate makes the held-out error fall, with its interval."""
+    """Draw by how much each fitted candidate makes the held-out error fall, with its interval.
+
+    What makes it rise by more than any makes it fall stands at the edge, as an arrow.
+    """
     shown = [c for c in candidates if was_fitted(c)][::-1]
     gains = [c.held_out_gain for c in shown]
+    falls = [100 * g.high for g in gains if g.high > 0] or [-100 * g.low for g in gains]
+    most = max(falls, default=1.0)
+    beyond = [100 * g.estimate < -most for g in gains]
     colours = [GOOD if c.passes else FAINT for c in shown]
     figure = go.Figure(
         go.Scatter(
-            x=[100 * g.estimate for g in gains],
+            x=[max(100 * g.estimate, -most) for g in gains],
             y=[label(c) for c in shown],
             mode="markers",
-            marker={"color": colours, "size": 11},
-            hoverinfo="x",
+            marker={
+                "color": colours,
+                "size": 11,
+                "symbol": ["triangle-left" if b else "circle" for b in beyond],
+            },
+            customdata=[100 * g.estimate for g in gains],
+            hovertemplate="%{customdata:.3g}<extra></extra>",
         )
     )
     for candidate, gain, colour in zip(shown, gains, colours, strict=True):
         figure.add_scatter(
-            x=[100 * gain.low, 100 * gain.high],
+            x=[max(100 * gain.low, -most), max(100 * gain.high, -most)],
             y=[label(candidate)] * 2,
             mode="lines",
             line={"color": colour, "width": 3},
-            hoverinfo="x",
+            hoverinfo="skip",
         )
     figure = styled(figure, height=130 + LINE_HEIGHT * len(shown), showlegend=False)
     figure.add_vline(0, line={"color": SOFT, "width": 1})
-    ends = [0.0, *(100 * g.low for g in gains), *(100 * g.high for g in gains)]
-    margin = 0.05 * (max(ends) - min(ends))
-    figure.update_xaxes(range=[min(ends) - margin, max(ends) + margin])
+    lowest = min([0.0, *(max(100 * g.low, -most) for g in gains)])
+    margin = 0.05 * (most - lowest)
+    figure.update_xaxes(range=[lowest - margin, most + margin])
     return figure.update_xaxes(title_text="fall of the held-out error [% of the spread]")
 
 

@@ -312,7 +312,7 @@ def _ranking(diagnosis: Diagnosis) -> list[Section]:
                 figures.ranking(diagnosis.candidates),
                 "How much the error on held-out recordings falls if this effect alone is added and "
                 "fitted, with its 95 % interval. Green: it passes every test. Grey: it does not; "
-                "the table says why.",
+                "the table says why. An arrow at the edge: the error rises by more than shown.",
                 "What each effect would explain",
             )
         )

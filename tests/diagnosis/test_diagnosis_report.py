@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis import Diagnosis, Recording, load_model
+from garat_jax.diagnosis import Diagnosis, Recording, figures, load_model
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.report import diagnosis_lead, diagnosis_sections, write_diagnosis
@@ -121,6 +121,19 @@ def test_page_of_a_missing_effect_has_every_part(tmp_path):
     assert "recording_1.csv, in which the model as it is does worst" in page
     assert "garat diagnose pendulum.xml" in page
     assert "nan" not in page.lower().replace("name", "")
+
+
+def test_one_hopeless_effect_does_not_flatten_the_others():
+    hopeless = dataclasses.replace(
+        FRICTION, effect="cogging_torque", passes=False, held_out_gain=Interval(-9.0, -30.0, -1.0)
+    )
+    figure = figures.ranking([FRICTION, hopeless])
+    low, high = figure.layout.xaxis.range
+    assert 100 * 0.25 < high < 100 * 0.3 and -100 * 0.3 < low < 0
+    points = figure.data[0]
+    assert list(points.marker.symbol) == ["triangle-left", "circle"]
+    assert points.x[0] == pytest.approx(-25.0)
+    assert points.customdata[0] == pytest.approx(-900.0)
 
 
 def test_page_of_an_adequate_model_promises_no_repair(tmp_path):
