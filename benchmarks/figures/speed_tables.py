@@ -116,6 +116,25 @@ def _learning(result: dict[str, Any]) -> str:
     return table(("mean return", *steps), lines)
 
 
+def targets() -> str:
+    return if_measured(_targets, "learning", "targets")
+
+
+def _targets(result: dict[str, Any]) -> str:
+    """One row a pair: what ours reaches in its target, and how many seeds solve it."""
+    lines = [
+        (
+            row["env"],
+            *(f"{sum(returns) / len(returns):,.4g}" for returns in row["returns"]),
+            f"{row['solved_return']:,.4g}",
+            f"{sum(row['solved'])} of {len(row['solved'])}",
+        )
+        for row in result["targets"]
+    ]
+    steps = [f"{steps:,} steps" for steps in result["targets"][0]["steps"]]
+    return table(("target of", *steps, "solved from", "seeds that solve it"), lines)
+
+
 def start() -> str:
     return if_measured(_start, "start")
 

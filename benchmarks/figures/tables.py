@@ -235,6 +235,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "throughput": speed_tables.throughput,
     "parts": speed_tables.parts,
     "learning": speed_tables.learning,
+    "targets": speed_tables.targets,
     "start": speed_tables.start,
     "growth": speed_tables.growth,
     "seeds_together": speed_tables.seeds_together,
