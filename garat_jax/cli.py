@@ -170,8 +170,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             say(f"{PROGRAM} {__version__}")
         elif command := parse(arguments, COMMANDS, DESCRIPTION):
             command.run()
-    except KeyboardInterrupt:
-        return complain(f"interrupted; {how_to_go_on(arguments, COMMANDS)}", INTERRUPTED)
+    except KeyboardInterrupt as stop:
+        from garat_jax.runs import EarlierRunStays
+
+        stays = isinstance(stop, EarlierRunStays)
+        news = f"interrupted; {stop}" if stays else "interrupted"
+        go_on = how_to_go_on(arguments, COMMANDS, begun=not stays)
+        return complain(f"{news}; {go_on}", INTERRUPTED)
     except DivergedError as error:
         return complain(f"error: {error}", FAILED)
     except UserError as error:

@@ -47,12 +47,18 @@ def parse(arguments: Sequence[str], commands: Mapping[str, type], description: s
     raise UserError(_one_line(complaint.getvalue()))
 
 
-def how_to_go_on(arguments: Sequence[str], commands: Mapping[str, type]) -> str:
-    """Return the command line that continues an interrupted one, or else starts it again."""
+def how_to_go_on(arguments: Sequence[str], commands: Mapping[str, type], begun: bool = True) -> str:
+    """Return the command line that continues an interrupted one, or else starts it again.
+
+    Args:
+        arguments: The command line that was interrupted, without the program's name.
+        commands: The dataclass of each command.
+        begun: Whether it left something to go on with.
+    """
     kept = [argument for argument in arguments if argument not in ("--force", "--resume")]
     command = commands.get(kept[0]) if kept else None
     options = _option_names(command) if command else []
-    if "--resume" in options:
+    if begun and "--resume" in options:
         return f"go on with: {shlex.join([PROGRAM, *kept, '--resume'])}"
     if "--force" in options:
         return f"start again with: {shlex.join([PROGRAM, *kept, '--force'])}"

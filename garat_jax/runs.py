@@ -236,6 +236,10 @@ def finite_or_null(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+class EarlierRunStays(KeyboardInterrupt):
+    """Ctrl-C came before a run that replaces another had results; its text says where that is."""
+
+
 @contextlib.contextmanager
 def earlier_run_kept(root: Path) -> Iterator[None]:
     """Keep the run that a folder holds until another one has results in its place.
@@ -247,6 +251,7 @@ def earlier_run_kept(root: Path) -> Iterator[None]:
         root: The folder that a run with `force` will replace.
 
     Raises:
+        EarlierRunStays: Ctrl-C came before there were results.
         UserError: The folder holds something else than a run, or the current folder is within it.
     """
     root = Path(os.path.abspath(root))  # `.` has no name
@@ -261,6 +266,10 @@ def earlier_run_kept(root: Path) -> Iterator[None]:
     root.rename(aside)
     try:
         yield
+    except KeyboardInterrupt:
+        if _holds_results(root):
+            raise
+        raise EarlierRunStays(f"the earlier run stays in {root}") from None
     finally:
         if _holds_results(root):
             shutil.rmtree(aside)

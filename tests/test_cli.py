@@ -7,6 +7,7 @@ import pytest
 from garat_jax import cli
 from garat_jax.commandline import parse
 from garat_jax.errors import DivergedError, UserError, nearest, unknown_name
+from garat_jax.runs import RunDirectory, earlier_run_kept
 
 
 def garat(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -130,6 +131,27 @@ def test_an_interrupt_says_how_to_go_on(failing, capsys):
     assert cli.main(["fail", "--how", "interrupt", "--force"]) == 130
     line = capsys.readouterr().err
     assert line == "garat: interrupted; go on with: garat fail --how interrupt --resume\n"
+
+
+def test_an_interrupt_before_a_replacement_has_results_leaves_the_earlier_run(
+    tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "run"
+    earlier = RunDirectory.create(out, {}, "garat fail", [0])
+    earlier.log(1, loss=0.5)
+
+    def interrupted(self):
+        with earlier_run_kept(out):
+            RunDirectory.create(out, {}, "garat fail", [0], force=True)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Failing, "run", interrupted)
+    monkeypatch.setitem(cli.COMMANDS, "fail", Failing)
+    assert cli.main(["fail", "--force"]) == 130
+    line = capsys.readouterr().err
+    said = f"the earlier run stays in {out}; start again with: garat fail --force\n"
+    assert line == f"garat: interrupted; {said}"
+    assert [entry["loss"] for entry in RunDirectory.open(out).metrics()] == [0.5]
 
 
 def test_an_interrupt_of_what_cannot_resume_says_how_to_start_again(monkeypatch, capsys):
