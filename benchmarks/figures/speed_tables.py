@@ -45,7 +45,28 @@ def _throughput(result: dict[str, Any]) -> str:
     for row in rows:
         cells.setdefault(_side(row), {})[row["env"]] = _rate(row)
     lines = [(side, *(found.get(name, "") for name in worlds)) for side, found in cells.items()]
-    return table(("steps/s", *(WORLDS[name] for name in worlds)), lines)
+    return table(("steps/s", *(WORLDS[name] for name in worlds)), lines) + _ceiling(rows, worlds)
+
+
+def _ceiling(rows: list[dict[str, Any]], worlds: list[str]) -> str:
+    """Say how much faster than the peer's TRPO the engine is that both step."""
+    parts = []
+    for name in worlds:
+        of_world = [row for row in rows if row["env"] == name]
+        engine = [r["steps_per_second"] for r in of_world if r["agent"] == "engine alone"]
+        peers = [
+            r["steps_per_second"]
+            for r in of_world
+            if r["agent"] == "sb3-contrib trpo" and r["stepped"] != OWN
+        ]
+        if engine and peers:
+            parts.append(f"{max(engine) / max(peers):.1f} on {WORLDS[name]}")
+    if not parts:
+        return ""
+    return (
+        "\nC MuJoCo alone is as many times as fast as sb3-contrib's TRPO in the same world: "
+        f"{', '.join(parts)}. No learner that steps the same physics can exceed that.\n"
+    )
 
 
 def _side(row: dict[str, Any]) -> str:
