@@ -59,6 +59,11 @@ def test_a_slippery_table_is_named_and_every_contact_effect_is_judged():
     few = {kind: CATALOGUE[kind] for kind in kinds}
     model = Model("puck", __file__, __file__, mujoco.MjSpec.from_string(PUCK), catalogue=few)
     found = diagnose(model, [record(0.3, seed) for seed in range(3)])
-    assert found.selected[0].effect == "contact_friction"
+    first, twin = found.candidates[:2]
+    assert found.selected[0].effect == first.effect == twin.effect == "contact_friction"
+    # Puck and table touch nothing but each other: one contact with two names.
+    assert first.indistinguishable_from == (twin.named,)
+    assert twin.indistinguishable_from == (first.named,)
+    assert first.parameters == twin.parameters
     judged = {(c.effect, c.target) for c in found.candidates}
     assert {("contact_compliance", "geom/puck"), ("contact_compliance", "geom/table")} <= judged
