@@ -53,16 +53,13 @@ def fit_contenders(
     likely = [s for s in scores if not s.excluded and s.possible and s.share > 0.02]
     likely = [s for s in likely if s.share > 0.25 * likely[0].share]
     likely = [s for s in likely if not simpler_law(problem, s, likely)]
+    likely = [s for i, s in enumerate(likely) if not _twins(problem, s, likely[:i])]
     if not likely:
         return []
     chosen = likely[:CONTENDERS]
     chosen += [s for s in likely[CONTENDERS:] if cosine(s, likely[0]) > EQUIVALENT]
     contenders: list[Contender] = []
     for score in chosen:
-        twin = next((c for c in contenders if _is_same(problem, score, c.score)), None)
-        if twin is not None:
-            contenders.append(_renamed(problem, current, twin, score))
-            continue
         rival = min((c.fit.cost[problem.fitted].sum() for c in contenders), default=np.inf)
         hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
@@ -70,29 +67,6 @@ def fit_contenders(
             continue
         contenders.append(_fit(problem, current, score, rival, say))
     return contenders
-
-
-def _is_same(problem: Problem, one: Score, other: Score) -> bool:
-    """Say whether two candidates are one change with two names.
-
-    Two geoms that touch nothing but each other have the same contacts.
-    """
-    kinds = {problem.simulator.effects[score.effect].kind for score in (one, other)}
-    return len(kinds) == 1 and cosine(one, other) > SAME and np.allclose(one.size, other.size)
-
-
-def _renamed(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender:
-    """Return a contender's fit as that of the same change under another name."""
-    slots = problem.simulator.slots
-    names = columns_of(slots, score.effect)
-    column = {j: names[slots[j].parameter.name] for j in twin.score.columns}
-    theta = np.array(twin.fit.theta)
-    theta[list(twin.score.columns)] = current.theta[list(twin.score.columns)]
-    theta[list(column.values())] = twin.fit.theta[list(column)]
-    free = tuple(column.get(j, j) for j in twin.fit.free)
-    frozen = tuple(column.get(j, j) for j in twin.fit.frozen)
-    renamed = dataclasses.replace(twin.fit, theta=theta, free=free, frozen=frozen)
-    return Contender(score, renamed)
 
 
 def fit_refinements(
@@ -146,6 +120,42 @@ def fit_further(problem: Problem, best: Contender, say: Callable[[str], None]) -
     fitted = fit(problem, best.fit.theta, start, free, sensitivity=sensitivity)
     score = dataclasses.replace(best.score, columns=(*best.score.columns, *further))
     return [Contender(score, fitted)]
+
+
+def with_twins(
+    problem: Problem, current: Fit, scores: Sequence[Score], contenders: Sequence[Contender]
+) -> list[Contender]:
+    """Add the candidates that are a contender under another name, with its fit.
+
+    Two geoms that touch nothing but each other have the same contacts.
+    """
+    fitted = {contender.score.effect for contender in contenders}
+    others = [s for s in scores if not s.excluded and s.effect not in fitted]
+    found = [_renamed(problem, current, c, s) for c in contenders
+             for s in _twins(problem, c.score, others)]  # fmt: skip
+    return [*contenders, *found]
+
+
+def _twins(problem: Problem, score: Score, others: Sequence[Score]) -> list[Score]:
+    """Return the candidates of the same kind that change the very same."""
+    effects = problem.simulator.effects
+    kind = effects[score.effect].kind
+    same = [s for s in others if effects[s.effect].kind == kind and cosine(score, s) > SAME]
+    return [s for s in same if len(s.size) == len(score.size) and np.allclose(s.size, score.size)]
+
+
+def _renamed(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender:
+    """Return a contender's fit as that of the same change under another name."""
+    slots, old = problem.simulator.slots, list(twin.score.columns)
+    names = columns_of(slots, score.effect)
+    new = {j: names[slots[j].parameter.name] for j in old}
+    theta = np.array(twin.fit.theta)
+    theta[old] = current.theta[old]
+    theta[list(new.values())] = twin.fit.theta[old]
+    free = tuple(new.get(j, j) for j in twin.fit.free)
+    frozen = tuple(new.get(j, j) for j in twin.fit.frozen)
+    fitted = dataclasses.replace(twin.fit, theta=theta, free=free, frozen=frozen)
+    return Contender(dataclasses.replace(score, columns=tuple(new.values())), fitted)
 
 
 def with_evidence(
