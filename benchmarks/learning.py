@@ -2,8 +2,8 @@
 
 `python benchmarks/learning.py`: five seeds of each with the same hyper-parameters; mean returns of
 the policies' mean actions over 50 whole episodes, at four points of the training. The peer's
-observations are normalised like ours, which it leaves to its user. Its seeds run in `--jobs`
-processes. Ours also learns in the targets of the pairs, which it should solve.
+observations are normalised like ours, which it leaves to its user, and its line search is as the
+library has it. Its seeds run in `--jobs` processes. Ours also learns in the targets of the pairs, which it should solve.
 """
 
 # pyright: reportMissingImports=false
@@ -102,7 +102,7 @@ def learn_peer(name: str, seed: int, steps: int) -> list[float]:
     envs = VecNormalize(make_envs(name, world, num_envs=num_envs), norm_reward=False)
     with warnings.catch_warnings():  # advice on batch sizes
         warnings.simplefilter("ignore")
-        learner = make_trpo(envs, seed)
+        learner = make_trpo(envs, seed, shrinking=0.8)
     judges = to_gymnasium_vector(world.env, world.params, EPISODES)
     found = []
     for _ in range(POINTS):
