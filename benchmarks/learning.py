@@ -3,7 +3,8 @@
 `python benchmarks/learning.py`: five seeds of each with the same hyper-parameters; mean returns of
 the policies' mean actions over 50 whole episodes, at four points of the training. The peer's
 observations are normalised like ours, which it leaves to its user, and its line search is as the
-library has it. Its seeds run in `--jobs` processes. Ours also learns in the targets of the pairs, which it should solve.
+library has it. Its seeds run in `--jobs` processes. Ours also learns in the targets of the pairs,
+which it should solve.
 """
 
 # pyright: reportMissingImports=false

@@ -19,7 +19,7 @@ from garat_jax.commands.console import complain, make_run, print_table, say
 from garat_jax.commands.diagnosis import Compare, Diagnose, Ground, Improve, Plan
 from garat_jax.commands.machine import Device, Doctor
 from garat_jax.commands.models import Add, Convert, Effects, Export
-from garat_jax.errors import DivergedError, UserError, choose
+from garat_jax.errors import DivergedError, EarlierRunStays, UserError, choose
 
 DESCRIPTION = "Ground a simulator in data, and find the physical effect that it is missing."
 
@@ -171,8 +171,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif command := parse(arguments, COMMANDS, DESCRIPTION):
             command.run()
     except KeyboardInterrupt as stop:
-        from garat_jax.runs import EarlierRunStays
-
         stays = isinstance(stop, EarlierRunStays)
         news = f"interrupted; {stop}" if stays else "interrupted"
         go_on = how_to_go_on(arguments, COMMANDS, begun=not stays)

@@ -1,5 +1,6 @@
 """C MuJoCo within compiled programs: a callback that steps a whole batch on threads."""
 
+import collections
 import contextlib
 import functools
 import hashlib
@@ -22,10 +23,16 @@ KEPT_BATCHES = 16
 """Batches of simulations, of all models together, that are kept for the next call."""
 INPUTS = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
 
+UNSTABLE = tuple(f"Nan, Inf or huge value in {name}" for name in ("QPOS", "QVEL", "QACC"))
+"""How warnings begin of which callers see the consequence: a state that is not finite."""
+
 _log = logging.getLogger(__name__)
-# MuJoCo would print each warning and append it to MUJOCO_LOG.TXT in the current folder. Callers see
-# states that are not finite, and say so in words of their own.
-mujoco.set_mju_user_warning(_log.debug)
+_warnings: collections.deque[str] = collections.deque(maxlen=100)
+_warned: set[str] = set()
+# MuJoCo would print each warning and append it to MUJOCO_LOG.TXT in the current folder. This is
+# called within C, on any thread; were it Python code, Ctrl-C would abort the process there.
+if mujoco.get_mju_user_warning() is None:
+    mujoco.set_mju_user_warning(_warnings.append)
 
 _idle: list[tuple[tuple, Batch]] = []
 """Simulations that no call uses now, those used last at the end; scratch space without a state."""
@@ -134,6 +141,7 @@ class HostModel:
             _write_state(batch, rows)
             controls = np.broadcast_to(control, leading + control.shape[-2:])
             result = function(batch, controls.reshape(num, *control.shape[-2:]), _finite(rows))
+            _log_warnings()
             with np.errstate(over="ignore"):  # what exploded is infinite in 32 bits
                 result = result.astype(row.dtype)
         return result.reshape(*leading, -1).view(np.uint32)
@@ -185,6 +193,21 @@ class HostModel:
         with _idle_lock:
             _idle.append((key, batch))
             del _idle[:-KEPT_BATCHES]
+
+
+def _log_warnings() -> None:
+    """Log what MuJoCo warned of: that it is unstable for debugging, anything else once, aloud."""
+    for _ in range(len(_warnings)):
+        try:
+            message = _warnings.popleft()
+        except IndexError:  # another call logged it
+            return
+        what = message.partition(" Time =")[0]
+        if what.startswith(UNSTABLE):
+            _log.debug(message)
+        elif what not in _warned:
+            _warned.add(what)
+            _log.warning("MuJoCo: %s", message)
 
 
 def _to_words(values: jax.Array) -> jax.Array:

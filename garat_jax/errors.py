@@ -11,6 +11,10 @@ class UserError(ValueError):
     """Say in one line what the user's input lacks and how to mend it."""
 
 
+class EarlierRunStays(KeyboardInterrupt):
+    """Ctrl-C came before a run that replaces another had results; its text says where that is."""
+
+
 class DivergedError(RuntimeError):
     """Say in one line at which step and seed a computation stopped being finite."""
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from garat_jax.errors import UserError
+from garat_jax.errors import EarlierRunStays, UserError
 from garat_jax.provenance import provenance, versions
 
 FORMAT = "garat-run/1"
@@ -234,10 +234,6 @@ def finite_or_null(value: Any) -> Any:
     if isinstance(value, list):
         return [finite_or_null(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-class EarlierRunStays(KeyboardInterrupt):
-    """Ctrl-C came before a run that replaces another had results; its text says where that is."""
 
 
 @contextlib.contextmanager

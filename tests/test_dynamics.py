@@ -2,6 +2,8 @@
 
 import functools
 import logging
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -277,8 +279,45 @@ def test_a_simulation_that_diverges_prints_nothing_and_leaves_no_file(
     state = dynamics.initial_state(world, jnp.zeros(1), jnp.full(1, 1e20))
     dynamics.step(world, state, jnp.zeros(1), 4).qvel.block_until_ready()
     assert "unstable" in caplog.text
+    assert not [record for record in caplog.records if record.levelno > logging.DEBUG]
     assert capfd.readouterr() == ("", "")
     assert not list(tmp_path.iterdir())
+
+
+def test_other_warnings_of_mujoco_are_logged_aloud_and_once(monkeypatch, caplog):
+    monkeypatch.setattr("garat_jax.engine._warned", set())
+    world = compiled(PENDULUM, engine="mujoco")
+    state = dynamics.initial_state(world, jnp.zeros(1), jnp.zeros(1))
+    for _ in range(2):
+        dynamics.step(world, state, jnp.full(1, jnp.nan), 4).qvel.block_until_ready()
+    (record,) = [record for record in caplog.records if record.name == "garat_jax.engine"]
+    assert record.levelno == logging.WARNING and "CTRL" in record.getMessage()
+
+
+INTERRUPTED = """
+import os, signal, threading
+import jax, jax.numpy as jnp
+from garat_jax import dynamics
+from garat_jax.env import make_world
+from garat_jax.envs.inverted_pendulum import InvertedPendulum
+
+world = make_world(InvertedPendulum(), engine="mujoco")
+speeds = jnp.zeros((8, 2)).at[4:].set(1e20)  # the first last long, the others diverge after them
+states = jax.vmap(lambda v: dynamics.initial_state(world.params, jnp.zeros(2), v))(speeds)
+step = jax.jit(jax.vmap(lambda s: dynamics.step(world.params, s, jnp.zeros(1), 30_000)))
+run = step.lower(states).compile()
+threading.Timer(0.1, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+try:
+    jax.block_until_ready(run(states))
+except (KeyboardInterrupt, jax.errors.JaxRuntimeError):
+    print("stopped")
+"""
+
+
+def test_ctrl_c_while_mujoco_warns_does_not_abort_the_process():
+    program = [sys.executable, "-c", INTERRUPTED]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "stopped\n"), done.stderr[-1000:]
 
 
 def test_the_native_model_is_what_the_engine_steps():
