@@ -176,6 +176,8 @@ def main() -> None:
     cases = cases[: arguments.sample]
     path = (arguments.out or Path("runs") / f"{NAME}-{arguments.seed}") / "rows.jsonl"
     earlier = recorded_rows(arguments.seed) if arguments.extend else {}
+    if beyond := earlier.keys() - {case.name for case in cases}:
+        parser.error(f"--extend would drop {len(beyond)} recorded sets; give a larger --sample")
     rows = run(cases, arguments.robots, arguments.jobs, path, earlier | read_rows(path))
     lines = report(rows)
     picked = arguments.only or arguments.robots != list(ROBOTS)

@@ -142,6 +142,9 @@ def _hidden_effects(result: dict[str, Any]) -> str:
         f"{result['seeds'][0]}; a set took {seconds['value']:.0f} s (median), at most "
         f"{seconds['largest']:.0f} s. The result file names the sets that fall short.\n"
     )
+    commits = sorted({row["commit"][:7] for row in result["rows"]})
+    if len(commits) > 1:
+        text += f"Sets were diagnosed at the commits {', '.join(commits)}.\n"
     columns = ("measure", "share", "95 % interval", "of", "held to")
     return table(columns, lines) + text
 

@@ -123,35 +123,52 @@ def fit_further(problem: Problem, best: Contender, say: Callable[[str], None]) -
 
 
 def with_twins(
-    problem: Problem, current: Fit, scores: Sequence[Score], contenders: Sequence[Contender]
+    problem: Problem,
+    current: Fit,
+    scores: Sequence[Score],
+    contenders: Sequence[Contender],
+    say: Callable[[str], None],
 ) -> list[Contender]:
-    """Add the candidates that are a contender under another name, with its fit.
+    """Add the candidates that are a contender under another name.
 
-    Two geoms that touch nothing but each other have the same contacts.
+    Two geoms that touch nothing but each other have the same contacts: one fit serves both. Where
+    segments that were not screened show a difference, the other has a fit of its own.
     """
+    screened = {score.effect: score for score in scores}
     fitted = {contender.score.effect for contender in contenders}
     others = [s for s in scores if not s.excluded and s.effect not in fitted]
-    found = [_renamed(problem, current, c, s) for c in contenders
-             for s in _twins(problem, c.score, others)]  # fmt: skip
+    found = []
+    for contender in contenders:
+        for score in _twins(problem, screened[contender.score.effect], others):
+            renamed = _renamed(problem, current, contender, score)
+            rival = contender.fit.cost[problem.fitted].sum()
+            found.append(renamed or _fit(problem, current, score, rival, say))
     return [*contenders, *found]
 
 
 def _twins(problem: Problem, score: Score, others: Sequence[Score]) -> list[Score]:
-    """Return the candidates of the same kind that change the very same."""
-    effects = problem.simulator.effects
-    kind = effects[score.effect].kind
-    same = [s for s in others if effects[s.effect].kind == kind and cosine(score, s) > SAME]
-    return [s for s in same if len(s.size) == len(score.size) and np.allclose(s.size, score.size)]
+    """Return the candidates of the same kind that change the very same where they were screened."""
+    simulator = problem.simulator
+
+    def what(score: Score) -> list[str]:
+        names = [simulator.slots[j].parameter.name for j in score.columns]
+        return [simulator.effects[score.effect].kind, *names]
+
+    same = [s for s in others if what(s) == what(score) and cosine(score, s) > SAME]
+    return [s for s in same if np.allclose(s.size, score.size)]
 
 
-def _renamed(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender:
-    """Return a contender's fit as that of the same change under another name."""
+def _renamed(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender | None:
+    """Return a contender's fit under another name; None if that predicts something else."""
     slots, old = problem.simulator.slots, list(twin.score.columns)
     names = columns_of(slots, score.effect)
     new = {j: names[slots[j].parameter.name] for j in old}
     theta = np.array(twin.fit.theta)
     theta[old] = current.theta[old]
     theta[list(new.values())] = twin.fit.theta[old]
+    predicted = problem.simulator.predict(theta[None], twin.fit.start[None], problem.segments)
+    if not np.allclose(problem.whiten(predicted)[0], twin.fit.residual, atol=1e-6):
+        return None
     free = tuple(new.get(j, j) for j in twin.fit.free)
     frozen = tuple(new.get(j, j) for j in twin.fit.frozen)
     fitted = dataclasses.replace(twin.fit, theta=theta, free=free, frozen=frozen)

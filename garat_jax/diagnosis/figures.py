@@ -209,13 +209,14 @@ def ranking(candidates: Sequence[Candidate]) -> go.Figure:
     """
     shown = [c for c in candidates if was_fitted(c)][::-1]
     gains = [c.held_out_gain for c in shown]
-    falls = [100 * g.high for g in gains if g.high > 0] or [-100 * g.low for g in gains]
-    most = max(falls, default=1.0)
+    falls = [100 * g.high for g in gains if g.estimate > 0]
+    most = max(falls or [float(np.median([-100 * g.low for g in gains]))])
     beyond = [100 * g.estimate < -most for g in gains]
+    at = [max(100 * g.estimate, -most) for g in gains]
     colours = [GOOD if c.passes else FAINT for c in shown]
     figure = go.Figure(
         go.Scatter(
-            x=[max(100 * g.estimate, -most) for g in gains],
+            x=at,
             y=[label(c) for c in shown],
             mode="markers",
             marker={
@@ -223,13 +224,14 @@ def ranking(candidates: Sequence[Candidate]) -> go.Figure:
                 "size": 11,
                 "symbol": ["triangle-left" if b else "circle" for b in beyond],
             },
-            customdata=[100 * g.estimate for g in gains],
-            hovertemplate="%{customdata:.3g}<extra></extra>",
+            customdata=[[100 * g.estimate, 100 * g.low, 100 * g.high] for g in gains],
+            hovertemplate="%{customdata[0]:.3g} [%{customdata[1]:.3g}, %{customdata[2]:.3g}]"
+            "<extra></extra>",
         )
     )
     for candidate, gain, colour in zip(shown, gains, colours, strict=True):
         figure.add_scatter(
-            x=[max(100 * gain.low, -most), max(100 * gain.high, -most)],
+            x=[float(np.clip(100 * end, -most, most)) for end in (gain.low, gain.high)],
             y=[label(candidate)] * 2,
             mode="lines",
             line={"color": colour, "width": 3},

@@ -95,7 +95,7 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         scores = screen(problem, current, held)
         contenders = fit_contenders(problem, current, scores, say) if gap else []
         contenders = _refine(problem, metric, current, scores, contenders, floor, say)
-        contenders = with_twins(problem, current, scores, contenders)
+        contenders = with_twins(problem, current, scores, contenders, say)
         contenders = with_evidence(problem, current, contenders, _num_tried(problem, scores))
         judged = _judge(problem, metric, current, scores, contenders, gap)
         first_round = first_round or tuple(candidate for candidate, _ in judged)

@@ -133,7 +133,12 @@ def test_one_hopeless_effect_does_not_flatten_the_others():
     points = figure.data[0]
     assert list(points.marker.symbol) == ["triangle-left", "circle"]
     assert points.x[0] == pytest.approx(-25.0)
-    assert points.customdata[0] == pytest.approx(-900.0)
+    assert points.customdata[0] == pytest.approx([-900.0, -3000.0, -100.0])
+    harmful = dataclasses.replace(FRICTION, held_out_gain=Interval(-0.02, -0.06, 0.0004))
+    worse = dataclasses.replace(OFFSET, held_out_gain=Interval(-0.01, -0.03, -0.002))
+    figure = figures.ranking([harmful, worse])
+    assert figure.layout.xaxis.range[0] < -2.0
+    assert set(figure.data[0].marker.symbol) == {"circle"}
 
 
 def test_page_of_an_adequate_model_promises_no_repair(tmp_path):
