@@ -306,9 +306,10 @@ speeds = jnp.zeros((8, 2)).at[4:].set(1e20)  # the first last long, the others d
 states = jax.vmap(lambda v: dynamics.initial_state(world.params, jnp.zeros(2), v))(speeds)
 step = jax.jit(jax.vmap(lambda s: dynamics.step(world.params, s, jnp.zeros(1), 30_000)))
 run = step.lower(states).compile()
-threading.Timer(0.1, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
 try:
-    jax.block_until_ready(run(states))
+    while True:
+        jax.block_until_ready(run(states))
 except (KeyboardInterrupt, jax.errors.JaxRuntimeError):
     print("stopped")
 """
