@@ -1,11 +1,13 @@
 """Result files, and tables made of them."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+ENGINES = {"mujoco": "C MuJoCo", "mjx": "MJX"}
+"""What tables call the engines."""
 
 
 def exists(name: str) -> bool:
@@ -28,3 +30,10 @@ def origin(name: str, result: dict[str, Any]) -> str:
         f"\n`{result['command']}` → `benchmarks/results/{name}.json` "
         f"(commit {result['git']['commit'][:7]}, {machine['cores']} cores of an {machine['cpu']})\n"
     )
+
+
+def if_measured(make: Callable[[dict[str, Any]], str], name: str, part: str = "rows") -> str:
+    """Return a table with its origin, or that a file or this part of it is not there yet."""
+    if exists(name) and part in (result := read(name)):
+        return make(result) + origin(name, result)
+    return f"Not measured yet: `python benchmarks/{name}.py`.\n"

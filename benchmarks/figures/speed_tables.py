@@ -1,9 +1,8 @@
 """The tables of docs/performance.md on learning: beside others, by parts, growing, together."""
 
-from collections.abc import Callable
 from typing import Any
 
-from results import ROOT, exists, origin, read, table
+from results import ENGINES, ROOT, if_measured, table
 
 WORLDS = {
     "inverted_pendulum": "InvertedPendulum",
@@ -14,7 +13,6 @@ WORLDS = {
     "minitaur": "Minitaur",
 }
 """Names of environments, in the order of the columns."""
-ENGINES = {"mujoco": "C MuJoCo", "mjx": "MJX"}
 ALGORITHMS = {"trpo": "TRPO", "ppo": "PPO"}
 PARTS = {
     "rollout": "rollout",
@@ -24,13 +22,6 @@ PARTS = {
     "value": "value fit",
     "statistics": "statistics",
 }
-
-
-def if_measured(make: Callable[[dict[str, Any]], str], name: str, part: str = "rows") -> str:
-    """Return a table with its origin, or that a file or this part of it is not there yet."""
-    if exists(name) and part in (result := read(name)):
-        return make(result) + origin(name, result)
-    return f"Not measured yet: `python benchmarks/{name}.py`.\n"
 
 
 def throughput() -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import speed_tables
 import tyro
-from results import ROOT, origin, read, table
+from results import ENGINES, ROOT, if_measured, origin, read, table
 
 BLOCK = re.compile(r"(<!-- table (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -88,7 +88,7 @@ def flags() -> str:
     rows = [
         (
             row["model"].replace("_", " "),
-            speed_tables.ENGINES[row["engine"]],
+            ENGINES[row["engine"]],
             emitters[row["fusion_emitters"]],
             f"{row['steps_per_second']:,.0f}",
             f"{row['compile_processor_seconds']:.1f}",
@@ -116,7 +116,7 @@ def optimisation_level() -> str:
 
 
 def hidden_effects() -> str:
-    return speed_tables.if_measured(_hidden_effects, "hidden_effects")
+    return if_measured(_hidden_effects, "hidden_effects")
 
 
 def _hidden_effects(result: dict[str, Any]) -> str:

@@ -210,7 +210,8 @@ def ranking(candidates: Sequence[Candidate]) -> go.Figure:
     shown = [c for c in candidates if was_fitted(c)][::-1]
     gains = [c.held_out_gain for c in shown]
     falls = [100 * g.high for g in gains if g.estimate > 0]
-    most = max(falls or [float(np.median([-100 * g.low for g in gains]))])
+    rises = [-100 * g.low for g in gains] or [0.0]
+    most = max(falls, default=float(np.median(rises)))
     beyond = [100 * g.estimate < -most for g in gains]
     at = [max(100 * g.estimate, -most) for g in gains]
     colours = [GOOD if c.passes else FAINT for c in shown]
