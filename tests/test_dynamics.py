@@ -295,7 +295,7 @@ def test_other_warnings_of_mujoco_are_logged_aloud_and_once(monkeypatch, caplog)
 
 
 INTERRUPTED = """
-import os, signal, threading
+import os, signal, threading, time
 import jax, jax.numpy as jnp
 from garat_jax import dynamics
 from garat_jax.env import make_world
@@ -306,11 +306,18 @@ speeds = jnp.zeros((8, 2)).at[4:].set(1e20)  # the first last long, the others d
 states = jax.vmap(lambda v: dynamics.initial_state(world.params, jnp.zeros(2), v))(speeds)
 step = jax.jit(jax.vmap(lambda s: dynamics.step(world.params, s, jnp.zeros(1), 30_000)))
 run = step.lower(states).compile()
-threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+
+def interrupt():  # again and again: Python drops what comes as a ctypes callback begins
+    while True:
+        time.sleep(0.5)
+        os.kill(os.getpid(), signal.SIGINT)
+
+threading.Thread(target=interrupt, daemon=True).start()
 try:
     while True:
         jax.block_until_ready(run(states))
 except (KeyboardInterrupt, jax.errors.JaxRuntimeError):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     print("stopped")
 """
 
