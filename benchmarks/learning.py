@@ -3,14 +3,17 @@
 `python benchmarks/learning.py`: five seeds of each with the same hyper-parameters; mean returns of
 the policies' mean actions over 50 whole episodes, at four points of the training. The peer's
 observations are normalised like ours, which it leaves to its user, and its line search is as the
-library has it. Its seeds run in `--jobs` processes. Ours also learns in the targets of the pairs,
-which it should solve.
+library has it. Its seeds run in `--jobs` processes. Both learn in two trust regions: the paper's,
+and that of the peer's user who gives it the paper's number, which it takes for a mean over the
+actions' components and not their sum. Ours also learns in the targets of the pairs, which it should
+solve. `--extend` keeps the rows of the result file and adds what it lacks; each names its commit.
 """
 
 # pyright: reportMissingImports=false
 import concurrent.futures
 import dataclasses
 import importlib.metadata
+import json
 import multiprocessing
 import warnings
 from pathlib import Path
@@ -29,13 +32,19 @@ from garat_jax.compiler_options import compiler_options
 from garat_jax.env import World, make_world
 from garat_jax.envs import ENVS
 from garat_jax.envs.pairs import PAIRS
+from garat_jax.provenance import git_state
 
+NAME = "learning"
+"""Of the result file."""
 POINTS = 4
 """How often in the training the policies are evaluated, evenly."""
 EPISODES = 50
 WITHIN = 0.1
 """Ours may lie below the peer's mean return by this share of it."""
 OURS, PEER = "garat_jax trpo", "sb3-contrib trpo"
+
+Kept = dict[tuple[str, str, float], dict[str, Any]]
+"""Rows of an earlier run, by where, who and trust region."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +61,8 @@ class Arguments:
     """How many seeds."""
     jobs: int = 2
     """Processes for the peer's seeds."""
+    extend: bool = False
+    """Keep the rows of the result file and add what it lacks."""
     out: Path = RESULTS
     """Folder for the results."""
 
@@ -60,9 +71,18 @@ def host_world(name: str) -> World:
     return make_world(ENVS[name](), engine="mujoco")
 
 
-def learn(world: World, seeds: int, steps: int) -> np.ndarray:
+def configs(world: World) -> list[TRPOConfig]:
+    """Return the paper's trust region, and as wide a one as the peer makes of its numbers."""
+    paper, num_actions = TRPOConfig(), world.env.action_size
+    wide = dataclasses.replace(
+        paper, max_kl=num_actions * paper.max_kl, cg_damping=num_actions * paper.cg_damping
+    )
+    return [paper, wide] if num_actions > 1 else [paper]
+
+
+def learn(world: World, config: TRPOConfig, seeds: int, steps: int) -> np.ndarray:
     """Train ours; return mean returns [points, seeds]."""
-    agent = trpo.make(world.env, TRPOConfig())
+    agent = trpo.make(world.env, config)
     options = compiler_options(world.params)
 
     def acting(params, obs: jax.Array, key: jax.Array):
@@ -89,7 +109,7 @@ def learn(world: World, seeds: int, steps: int) -> np.ndarray:
     return np.asarray(found)
 
 
-def learn_peer(name: str, seed: int, steps: int) -> list[float]:
+def learn_peer(name: str, config: TRPOConfig, seed: int, steps: int) -> list[float]:
     """Train one seed of the peer; return its mean returns [points]."""
     import torch
     from speed.torch_peers import make_envs, make_trpo
@@ -99,11 +119,10 @@ def learn_peer(name: str, seed: int, steps: int) -> list[float]:
 
     torch.set_num_threads(1)
     world = host_world(name)
-    num_envs = TRPOConfig().num_envs
-    envs = VecNormalize(make_envs(name, world, num_envs=num_envs), norm_reward=False)
+    envs = VecNormalize(make_envs(name, world, num_envs=config.num_envs), norm_reward=False)
     with warnings.catch_warnings():  # advice on batch sizes
         warnings.simplefilter("ignore")
-        learner = make_trpo(envs, seed, shrinking=0.8)
+        learner = make_trpo(envs, seed, shrinking=0.8, config=config)
     judges = to_gymnasium_vector(world.env, world.params, EPISODES)
     found = []
     for _ in range(POINTS):
@@ -120,45 +139,86 @@ def learn_peer(name: str, seed: int, steps: int) -> list[float]:
 
 
 def row_of(
-    where: str, agent: str, solved: float, returns: np.ndarray, steps: int
+    where: str, agent: str, config: TRPOConfig, solved: float, returns: np.ndarray, steps: int
 ) -> dict[str, Any]:
     """Return a row from mean returns [points, seeds]."""
     row = {
         "env": where,
         "agent": agent,
+        "max_kl": config.max_kl,
         "steps": [steps * (point + 1) // POINTS for point in range(POINTS)],
         "returns": returns.tolist(),
         "mean": float(returns[-1].mean()),
         "standard_error": float(returns[-1].std(ddof=1) / np.sqrt(returns.shape[1])),
         "solved_return": solved,
         "solved": [bool(best >= solved) for best in returns.max(axis=0)],
+        "commit": (git_state() or {}).get("commit"),
     }
     print(row, flush=True)
     return row
 
 
-def main() -> None:
-    arguments = tyro.cli(Arguments)
+def recorded_rows(arguments: Arguments) -> Kept:
+    """Return the rows of the result file with as many seeds and steps."""
+    path = arguments.out / f"{NAME}.json"
+    result = json.loads(path.read_text(encoding="utf-8"))
+    return {
+        (row["env"], row["agent"], row["max_kl"]): row
+        for row in [*result["rows"], *result["targets"]]
+        if row["steps"][-1] == arguments.steps and len(row["solved"]) == arguments.seeds
+    }
+
+
+def measure(arguments: Arguments, kept: Kept) -> list[dict[str, Any]]:
+    """Return a row for each world, agent and trust region."""
     seeds, steps = arguments.seeds, arguments.steps
-    rows, targets = [], []
+    worlds = {name: host_world(name) for name in arguments.envs}
+    sides = [(name, world, config) for name, world in worlds.items() for config in configs(world)]
+    rows = []
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(arguments.jobs, mp_context=context) as pool:
         peers = {
-            name: [pool.submit(learn_peer, name, seed, steps) for seed in range(seeds)]
-            for name in arguments.envs
+            (name, config): [pool.submit(learn_peer, name, config, k, steps) for k in range(seeds)]
+            for name, _, config in sides
+            if not kept.get((name, PEER, config.max_kl))
         }
-        for name, futures in peers.items():
-            world = host_world(name)
+        for name, world, config in sides:
             solved = world.env.task.solved_return
-            theirs = np.asarray([future.result() for future in futures]).T
-            rows.append(row_of(name, PEER, solved, theirs, steps))
-            rows.append(row_of(name, OURS, solved, learn(world, seeds, steps), steps))
-            least = rows[-2]["mean"] - WITHIN * abs(rows[-2]["mean"])
-            rows[-1]["met"] = rows[-1]["mean"] >= least
+            ours = kept.get((name, OURS, config.max_kl)) or row_of(
+                name, OURS, config, solved, learn(world, config, seeds, steps), steps
+            )
+            theirs = kept.get((name, PEER, config.max_kl))
+            if theirs is None:
+                returns = np.asarray([future.result() for future in peers[name, config]]).T
+                theirs = row_of(name, PEER, config, solved, returns, steps)
+            least = theirs["mean"] - WITHIN * abs(theirs["mean"])
+            rows += [theirs, ours | {"met": ours["mean"] >= least}]
+    return rows
+
+
+def measure_targets(arguments: Arguments, kept: Kept) -> list[dict[str, Any]]:
+    """Return a row for each pair's target."""
+    config, rows = TRPOConfig(), []
     for name in arguments.pairs:
         _, target = PAIRS[name].worlds("mujoco")
-        solved = target.env.task.solved_return
-        targets.append(row_of(name, OURS, solved, learn(target, seeds, steps), steps))
+        rows.append(
+            kept.get((name, OURS, config.max_kl))
+            or row_of(
+                name,
+                OURS,
+                config,
+                target.env.task.solved_return,
+                learn(target, config, arguments.seeds, arguments.steps),
+                arguments.steps,
+            )
+        )
+    return rows
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments)
+    kept = recorded_rows(arguments) if arguments.extend else {}
+    rows, targets = measure(arguments, kept), measure_targets(arguments, kept)
     details = {
         "peer": {k: importlib.metadata.version(k) for k in ("sb3-contrib", "torch")},
         "within": WITHIN,
@@ -166,9 +226,12 @@ def main() -> None:
         "targets": targets,
     }
     command = command_line()
-    folder = arguments.out
-    print(write_result("learning", rows, seeds=range(seeds), command=command, details=details,
-                       folder=folder))  # fmt: skip
+    seeds = range(arguments.seeds)
+    print(
+        write_result(
+            NAME, rows, seeds=seeds, command=command, details=details, folder=arguments.out
+        )
+    )
 
 
 if __name__ == "__main__":

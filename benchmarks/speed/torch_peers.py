@@ -105,15 +105,23 @@ def make_envs(env_name: str, world: World, num_envs: int, stepped: str = VECTOR)
     return DummyVecEnv([lambda: make(GYMNASIUM[env_name])] * num_envs)
 
 
-def make_trpo(envs: VecEnv, seed: int = 0, shrinking: float = 0.5) -> TRPO:
+def make_trpo(
+    envs: VecEnv, seed: int = 0, shrinking: float = 0.5, config: TRPOConfig | None = None
+) -> TRPO:
     """Build sb3-contrib's TRPO with the hyper-parameters of ours.
+
+    The peer averages the KL divergence over the actions' components (`kl_divergence` of
+    stable_baselines3 2.9.2, common/distributions.py, of independent normals), where Schulman et
+    al. 2015 and ours sum them; its limit and its damping of the Fisher information, which is that
+    divergence's Hessian, are divided by their number, so that the trust regions are the same.
 
     Ours normalises observations on top, which would cost the peer time, and leaves out the value's
     incomplete last minibatch. The peer takes the share of the batch on which ours estimates the
     Fisher information for the whole step of the policy, which costs it less. It takes a step only
-    within `target_kl`, ours within 1.5 times that; the library shrinks steps by 0.8, we by 0.5.
+    within its limit, ours within 1.5 times that; the library shrinks steps by 0.8, we by 0.5.
     """
-    config = TRPOConfig()
+    config = config or TRPOConfig()
+    (num_actions,) = envs.action_space.shape
     return TRPO(
         "MlpPolicy",
         envs,
@@ -123,12 +131,12 @@ def make_trpo(envs: VecEnv, seed: int = 0, shrinking: float = 0.5) -> TRPO:
         gamma=config.discount,
         gae_lambda=config.trace,
         cg_max_steps=config.cg_iterations,
-        cg_damping=config.cg_damping,
+        cg_damping=config.cg_damping / num_actions,
         sub_sampling_factor=round(1 / config.fisher_share),
         line_search_shrinking_factor=shrinking,
         line_search_max_iter=config.line_search_steps,
         n_critic_updates=config.value_epochs,
-        target_kl=config.max_kl,
+        target_kl=config.max_kl / num_actions,
         policy_kwargs=_networks(config.hidden, config.initial_log_std),
         seed=seed,
         device="cpu",
