@@ -20,6 +20,7 @@ from garat_jax.commands.diagnosis import Compare, Diagnose, Ground, Improve, Pla
 from garat_jax.commands.machine import Device, Doctor
 from garat_jax.commands.models import Add, Convert, Effects, Export
 from garat_jax.errors import DivergedError, EarlierRunStays, UserError, choose
+from garat_jax.interrupt import interruptible
 
 DESCRIPTION = "Ground a simulator in data, and find the physical effect that it is missing."
 
@@ -169,7 +170,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if arguments == ["--version"]:
             say(f"{PROGRAM} {__version__}")
         elif command := parse(arguments, COMMANDS, DESCRIPTION):
-            command.run()
+            with interruptible():
+                command.run()
     except KeyboardInterrupt as stop:
         stays = isinstance(stop, EarlierRunStays)
         news = f"interrupted; {stop}" if stays else "interrupted"

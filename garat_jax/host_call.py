@@ -25,6 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from garat_jax.interrupt import entered_from_c, raise_held
+
 TARGET = "garat_jax_host_call"
 INTERFACE = (0, 1)
 """Version of XLA's interface that this is written for; later minor versions take it too."""
@@ -176,6 +178,7 @@ def _array(buffer: _Buffer) -> np.ndarray:
     return np.ctypeslib.as_array(words).reshape(shape)
 
 
+@entered_from_c
 def _handle(frame) -> int | None:
     """Serve XLA: say which interface this is for, or call a function; return None or an error."""
     frame = frame.contents
@@ -191,6 +194,7 @@ def _handle(frame) -> int | None:
         arguments = frame.arguments
         inputs = [_array(arguments.items[i].contents) for i in range(arguments.size)]
         _array(frame.results.items[0].contents)[...] = function(inputs)
+        raise_held()
     except BaseException:  # whatever it is, it cannot pass through C
         error = _ErrorArguments(message=traceback.format_exc().encode(), code=INTERNAL_ERROR)
         error.header.struct_size = ctypes.sizeof(error)

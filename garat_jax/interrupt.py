@@ -1,36 +1,92 @@
-"""Ctrl-C at a moment of the program's choosing."""
+"""Ctrl-C at a moment that the program can stand.
+
+Python raises KeyboardInterrupt wherever the main thread happens to be. While XLA runs a program,
+that may be in a Python function which C entered (host_call.py): what is raised at its first line
+never reaches the caller, which goes on with a result that was not written, and raised at its last
+line it leaves C's memory in disorder. There Ctrl-C is held until the function can say so itself.
+"""
 
 import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from types import CodeType, FrameType
+from typing import TypeVar
+
+Function = TypeVar("Function", bound=Callable)
+
+_entered_from_c: set[CodeType] = set()
+_held = threading.Event()
+
+
+def entered_from_c(function: Function) -> Function:
+    """Declare a function that C enters; it shall call `raise_held` where it can raise."""
+    _entered_from_c.add(function.__code__)
+    return function
+
+
+def raise_held() -> None:
+    """Raise KeyboardInterrupt if Ctrl-C came within a function that C entered."""
+    if _held.is_set():
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C end the block, but never within a function that C entered.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C came; also where XLA made a RuntimeError of it.
+    """
+    with _handled_by(_interrupt):
+        yield
 
 
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
     """Hold Ctrl-C back until the block ends; the block can ask whether it came.
 
-    Python raises KeyboardInterrupt wherever the main thread happens to be. Within a compiled
-    program that is the engine's callback, and XLA turns it into an internal error. A second
-    Ctrl-C is not held back.
+    A second Ctrl-C is held back no longer than `interruptible` does.
 
     Raises:
         KeyboardInterrupt: At the end of the block, if Ctrl-C came.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False  # only the main thread receives signals
-        return
     came: list[int] = []
 
-    def note(number: int, frame: object) -> None:
+    def note(number: int, frame: FrameType | None) -> None:
         if came:
-            raise KeyboardInterrupt
+            _interrupt(number, frame)
         came.append(number)
 
-    previous = signal.signal(signal.SIGINT, note)
-    try:
+    with _handled_by(note):
         yield lambda: bool(came)
-    finally:
-        signal.signal(signal.SIGINT, previous)
     if came:
         raise KeyboardInterrupt
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, or hold it within a function that C entered."""
+    del number
+    while frame is not None:
+        if frame.f_code in _entered_from_c:
+            _held.set()
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread receives signals
+        return
+    previous = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    except RuntimeError as error:  # XLA's, of what `raise_held` raised
+        if not _held.is_set():
+            raise
+        raise KeyboardInterrupt from error
+    finally:
+        _held.clear()
+        signal.signal(signal.SIGINT, previous)

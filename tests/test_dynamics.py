@@ -300,6 +300,7 @@ import jax, jax.numpy as jnp
 from garat_jax import dynamics
 from garat_jax.env import make_world
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
+from garat_jax.interrupt import interruptible
 
 world = make_world(InvertedPendulum(), engine="mujoco")
 speeds = jnp.zeros((8, 2)).at[4:].set(1e20)  # the first last long, the others diverge after them
@@ -307,18 +308,21 @@ states = jax.vmap(lambda v: dynamics.initial_state(world.params, jnp.zeros(2), v
 step = jax.jit(jax.vmap(lambda s: dynamics.step(world.params, s, jnp.zeros(1), 30_000)))
 run = step.lower(states).compile()
 
-def interrupt():  # again and again: Python drops what comes as a ctypes callback begins
-    while True:
-        time.sleep(0.5)
+def interrupt():
+    for _ in range(60):
+        time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 
-threading.Thread(target=interrupt, daemon=True).start()
+thread = threading.Thread(target=interrupt, daemon=True)
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # but for the block
 try:
-    while True:
-        jax.block_until_ready(run(states))
-except (KeyboardInterrupt, jax.errors.JaxRuntimeError):
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interruptible():
+        thread.start()
+        while True:
+            jax.block_until_ready(run(states))
+except KeyboardInterrupt:
     print("stopped")
+    thread.join()
 """
 
 

@@ -3,7 +3,7 @@ import signal
 
 import pytest
 
-from garat_jax.interrupt import deferred_interrupt
+from garat_jax.interrupt import deferred_interrupt, entered_from_c, interruptible, raise_held
 
 
 def press():
@@ -31,3 +31,36 @@ def test_without_an_interrupt_nothing_happens_and_the_handler_is_back():
     with deferred_interrupt():
         pass
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_ends_a_block():
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        press()
+        pytest.fail("it went on")
+
+
+@pytest.mark.parametrize("block", [interruptible, deferred_interrupt])
+def test_an_interrupt_never_raises_within_what_c_entered(block):
+    reached = []
+
+    @entered_from_c
+    def callback():
+        press()
+        press()
+        reached.append("its end")
+        with pytest.raises(KeyboardInterrupt):
+            raise_held()
+
+    def program():
+        callback()
+        raise RuntimeError("INTERNAL: the callback failed")
+
+    with pytest.raises(KeyboardInterrupt), block():
+        program()
+    assert reached == ["its end"]
+    raise_held()  # nothing is held any more
+
+
+def test_errors_that_no_interrupt_made_stay_what_they_are():
+    with pytest.raises(RuntimeError, match="no memory"), interruptible():
+        raise RuntimeError("no memory")

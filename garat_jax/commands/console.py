@@ -13,6 +13,7 @@ from rich.table import Table
 
 from garat_jax.commandline import PROGRAM
 from garat_jax.errors import UserError
+from garat_jax.interrupt import interruptible
 
 if TYPE_CHECKING:
     from garat_jax.runs import RunDirectory
@@ -71,7 +72,8 @@ def make_run(
         if run.resumed and (changed := run.changed_versions()):
             complain(f"warning: the run was begun with other versions: {', '.join(changed)}", 0)
         try:
-            yield run
+            with interruptible():
+                yield run
         except (UserError, RuntimeError):
             run.discard()
             raise
