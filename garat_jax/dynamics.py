@@ -2,8 +2,8 @@
 
 `step` is the one seam between the engines. MJX is the reference: differentiable, for
 accelerators. C MuJoCo, called from within the compiled program, is the faster on a CPU.
-Effects reach both in the same two ways: as native model fields and as commands and generalised
-forces.
+Effects reach both in the same two ways: as native model fields, which may change from one substep
+to the next, and as commands and generalised forces.
 """
 
 import copy
@@ -206,8 +206,9 @@ def move(
         return state._replace(memory=memory)
 
     def substep(state: PhysicsState, _):
-        command, force, memory = _act(dynamics, model, state, ctrl, state.memory)
-        state = _advance(dynamics, constants, state, command[None], force[None], 1)
+        tuned, command, force, memory = _act(dynamics, model, state, ctrl, state.memory)
+        now = constants if tuned is model else _constants(dynamics, tuned)
+        state = _advance(dynamics, now, state, command[None], force[None], 1)
         return state._replace(memory=memory), None
 
     return jax.lax.scan(substep, state, length=num_substeps)[0]
@@ -237,7 +238,8 @@ def trajectory(
         num_substeps: Physics substeps of a control step.
         warm_up: Commands that fill the effects' memories before the motion begins.
         along: qpos and qvel that the effects see in each control step, [warm_up + T, nq + nv],
-            instead of those that they lead to: then effects may look at the state.
+            instead of those that they lead to: then effects may look at the state, if none tunes
+            the model.
 
     Returns:
         The states after each of the T control steps; of them only qpos and qvel are new.
@@ -259,7 +261,7 @@ def trajectory(
         return memory, tuple(results)
 
     def without_memory(command, force, seen):
-        command, more, _ = _act(then, model, look(seen), command, state.memory[count:])
+        _, command, more, _ = _act(then, model, look(seen), command, state.memory[count:])
         return command, force + more
 
     if count:
@@ -289,14 +291,16 @@ def note(dynamics: Dynamics, state: PhysicsState, seconds: float) -> PhysicsStat
 
 
 def _act(dynamics: Dynamics, model: ModelView, state, ctrl, memories):
-    """Apply every effect once: command [nu], generalised force [nv], memories."""
+    """Apply every effect once: model, command [nu], generalised force [nv], memories."""
     force = jnp.zeros(dynamics.host.model.nv, ctrl.dtype)
     updated = []
     for effect, memory in zip(dynamics.effects, memories, strict=True):
+        if effect.tunes:
+            model = model.replace(effect.tune(model, state, ctrl))
         ctrl, added, memory = effect.apply(model, state, ctrl, memory)
         force = force if added is None else force + added
         updated.append(memory)
-    return ctrl, force, tuple(updated)
+    return model, ctrl, force, tuple(updated)
 
 
 def _commands(dynamics: Dynamics, model: ModelView, seen, memory, ctrl, num_substeps: int):
@@ -308,7 +312,7 @@ def _commands(dynamics: Dynamics, model: ModelView, seen, memory, ctrl, num_subs
         return ctrl[None], jnp.zeros((1, dynamics.host.model.nv), ctrl.dtype), memory
 
     def substep(memory, _):
-        command, force, memory = _act(dynamics, model, seen, ctrl, memory)
+        _, command, force, memory = _act(dynamics, model, seen, ctrl, memory)
         return memory, (command, force)
 
     memory, (commands, forces) = jax.lax.scan(substep, memory, length=num_substeps)

@@ -282,6 +282,7 @@ class Simulator:
     def _predict_along(self, world, chosen: tuple[int, ...], theta, start, ctrl, place, path):
         """Predict one segment with candidates that look at a path [T + 1, nq + nv] instead."""
         world = self._with(world, chosen, theta)
+        world = world.replace(effects=tuple(effect.along_path() for effect in world.effects))
         between = (path[:-1] + path[1:]) / 2
         before = jnp.broadcast_to(path[0], (self._warm_up, *path.shape[1:]))
         return self._trace(world, start, ctrl, place, jnp.concatenate([before, between]))

@@ -116,10 +116,10 @@ class Effect(abc.ABC):
     """A physical effect at one place of a model.
 
     A subclass is a `flax.struct.dataclass` whose parameters are pytree leaves, so an effect can be
-    fitted, batched and differentiated. It says what it does in up to four ways:
+    fitted, batched and differentiated. It says what it does in up to five ways:
     `prepare` changes structure before the model is compiled, `fields` replaces native model
-    fields (both engines), `apply` changes commands and adds forces in every physics substep,
-    `sense` changes what is reported of the state.
+    fields (both engines), `tune` does so anew in every physics substep, `apply` changes commands
+    and adds forces in every physics substep, `sense` changes what is reported of the state.
 
     Attributes:
         target: Where it acts: `joint/NAME`, `actuator/NAME`, `body/NAME`, `geom/NAME`, `world`,
@@ -138,6 +138,8 @@ class Effect(abc.ABC):
     """Whether `apply` reads the physics state, which costs an engine call per substep."""
     senses: ClassVar[bool] = False
     """Whether `sense` does anything: the effect is one of sensors, not of the motion."""
+    tunes: ClassVar[bool] = False
+    """Whether `tune` does anything: a native field changes with the state, which is read."""
     notes: ClassVar[bool] = False
     """Whether `note` does anything: what is reported depends on states of some time ago."""
     refines: ClassVar[tuple[str, ...]] = ()
@@ -293,6 +295,17 @@ class Effect(abc.ABC):
         del model, state
         return ctrl, None, memory
 
+    def tune(self, model: ModelView, state: Any, ctrl: jax.Array) -> dict[str, jax.Array]:
+        """Return the native model fields that this effect replaces for one physics substep.
+
+        Args:
+            model: The model as all effects leave it, and those before this one in this substep.
+            state: The `PhysicsState`.
+            ctrl: Command as the effects before this one leave it, [nu].
+        """
+        del model, state, ctrl
+        return {}
+
     def note(self, host: mujoco.MjModel, state: Any, seconds: float, memory: Any) -> Any:
         """Return the memory after a control step, for `sense`; at the start `seconds` is 0.
 
@@ -312,6 +325,10 @@ class Effect(abc.ABC):
 
     def as_replayed(self) -> "Effect":
         """Return an effect that does the same where recorded commands are replayed, for less."""
+        return self
+
+    def along_path(self) -> "Effect":
+        """Return an effect without `tune` that does the same to first order along a given path."""
         return self
 
 

@@ -1,19 +1,17 @@
 """Friction at a joint: laws of speed, direction and load.
 
-Dry friction is MuJoCo's constraint row (frictionloss), which holds at rest and is stable at any
-timestep. A row has one size in both directions and at all speeds within a control step, so a law
-that is weaker somewhere adds a force along the motion there. That force starts at rest from zero
-and grows no faster than half as steep as the row itself, so that both together take energy away
-at every speed.
+Dry friction is MuJoCo's constraint row (frictionloss), which holds at rest, takes energy away and
+is stable at any timestep. Where a law depends on the motion, the row has another size in each
+substep.
 """
 
+import abc
 from collections.abc import Mapping
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from flax import struct
 
 from garat_jax.effects.at_joint import actuator_torque, at_dof, felt_inertia, is_driven
@@ -21,8 +19,6 @@ from garat_jax.effects.base import Effect, ModelView, element_id, parameter
 
 SMALLEST_FRICTION = 1e-9
 """Friction loss [N m] that makes MuJoCo reserve a constraint row without being felt."""
-SHARE_OF_ROW = 0.5
-"""Steepness of a force along the motion, relative to the friction row's own."""
 
 
 def reserve_row(spec: mujoco.MjSpec, joint: str) -> None:
@@ -31,37 +27,15 @@ def reserve_row(spec: mujoco.MjSpec, joint: str) -> None:
     element.frictionloss = max(element.frictionloss, SMALLEST_FRICTION)
 
 
-def row_steepness(model: ModelView, dof: int) -> jax.Array:
-    """Return the friction row's torque per speed near rest [N m s/rad], [].
-
-    From MuJoCo's documentation, "Solver parameters": the row's force is (b·v)/R with
-    R = (1 − d)/d·A, d = solimp[0] at zero, b = 2/(solimp[1]·timeconst), and A the inverse of the
-    inertia.
-    """
-    host = model.host
-    impedance, widest = (float(np.clip(host.dof_solimp[dof, i], 1e-4, 0.9999)) for i in (0, 1))
-    first, second = host.dof_solref[dof]
-    rate = 2.0 / max(float(first), 2.0 * host.opt.timestep) if first > 0 else -float(second)
-    return rate / widest * impedance / (1.0 - impedance) * felt_inertia(model, dof)
-
-
-def along_motion(model: ModelView, dof: int, speed: jax.Array, force: jax.Array) -> jax.Array:
-    """Return a force of a given size that is zero at rest and ramps up as a row allows, [].
-
-    Args:
-        model: The model as all effects leave it.
-        dof: The degree of freedom.
-        speed: Its speed, [].
-        force: Size of the force beyond the ramp, [].
-    """
-    most = SHARE_OF_ROW * row_steepness(model, dof) * jnp.abs(speed)
-    return jnp.clip(force, -most, most)
-
-
 def _drag(model: ModelView, dof: int, speed: jax.Array, slope: jax.Array) -> jax.Array:
     """Return slope·speed [N m], no more than what stops the felt inertia in a substep, []."""
     stopping = model.host.opt.timestep * slope / felt_inertia(model, dof)
     return slope * speed / (1.0 + stopping)
+
+
+def _more_friction(model: ModelView, joint: str, torque: jax.Array) -> dict[str, jax.Array]:
+    """Return the friction losses with more [N m] at one joint."""
+    return {"dof_frictionloss": model["dof_frictionloss"].at[_dof(model.host, joint)].add(torque)}
 
 
 def _dof(host: mujoco.MjModel, joint: str) -> int:
@@ -129,8 +103,7 @@ class CoulombFriction(Effect):
 
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Add to the joint's native friction loss."""
-        dofs = model.dofs(self.name)
-        return {"dof_frictionloss": model["dof_frictionloss"].at[dofs].add(self.torque)}
+        return _more_friction(model, self.name, self.torque)
 
     def export(self, spec: mujoco.MjSpec) -> str:
         """Add to the joint's friction loss."""
@@ -139,25 +112,78 @@ class CoulombFriction(Effect):
 
 
 @struct.dataclass
-class AsymmetricFriction(Effect):
+class VaryingFriction(Effect):
+    """Dry friction whose size follows the motion: a row of that size in each substep."""
+
+    elements: ClassVar[tuple[str, ...]] = ("joint",)
+    acts: ClassVar[bool] = True
+    reads_state: ClassVar[bool] = True
+    tunes: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def friction(self, model: ModelView, state, ctrl: jax.Array) -> jax.Array:
+        """Return the dry friction now [N m], []."""
+
+    def steady(self) -> jax.Array:
+        """Return the part of the dry friction [N m] that does not change much, []."""
+        return jnp.zeros(())
+
+    def prepare(self, spec: mujoco.MjSpec) -> None:
+        """Make the compiler reserve the friction constraint's row."""
+        reserve_row(spec, self.name)
+
+    def tune(self, model: ModelView, state, ctrl: jax.Array) -> dict[str, jax.Array]:
+        """Add the dry friction of this moment to the joint's friction loss."""
+        return _more_friction(model, self.name, self.friction(model, state, ctrl))
+
+    def along_path(self) -> Effect:
+        """Return a row of the steady part, and a force for the rest."""
+        return _FrictionAlongPath(self.target, self)
+
+
+@struct.dataclass
+class _FrictionAlongPath(Effect):
+    """A varying friction where the path is given, so that a force against it cannot overshoot."""
+
+    kind: ClassVar[str] = "friction_along_path"
+    acts: ClassVar[bool] = True
+    reads_state: ClassVar[bool] = True
+
+    varying: VaryingFriction
+
+    def fields(self, model: ModelView) -> dict[str, jax.Array]:
+        """Add the steady part to what the law itself replaces."""
+        model = model.replace(self.varying.fields(model))
+        return {
+            **self.varying.fields(model),
+            **_more_friction(model, self.name, self.varying.steady()),
+        }
+
+    def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
+        """Add the rest against the motion to what the law itself does."""
+        joint, dof = element_id(model.host, "joint", self.name), _dof(model.host, self.name)
+        more = self.varying.friction(model, state, ctrl) - self.varying.steady()
+        ctrl, force, memory = self.varying.apply(model, state, ctrl, memory)
+        against = at_dof(model.host, joint, -more * jnp.sign(state.qvel[dof]), ctrl.dtype)
+        return ctrl, against if force is None else force + against, memory
+
+
+@struct.dataclass
+class AsymmetricFriction(VaryingFriction):
     """Dry and viscous friction that differ between the directions of motion.
 
     τ = −(τ₊ + c₊·q̇) for q̇ > 0 and τ₋ − c₋·q̇ for q̇ < 0; at rest anything between −τ₊ and τ₋. The
-    mean dry friction and the smaller damping are native; half of the dry difference is a force that
-    does not change sign with the speed, and what the larger damping has more is taken
-    semi-implicitly. Shows as torque against speed that is not odd, which
-    a constant torque imitates at one speed. Typical: 10 to 30 % between the directions of worm and
-    harmonic drives and preloaded gears (Armstrong-Hélouvry, Dupont and Canudas de Wit 1994).
+    smaller damping is native; what the larger has more is taken semi-implicitly. Shows as torque
+    against speed that is not odd, which a constant torque imitates at one speed. Typical: 10 to
+    30 % between the directions of worm and harmonic drives and preloaded gears (Armstrong-Hélouvry,
+    Dupont and Canudas de Wit 1994).
     """
 
     kind: ClassVar[str] = "asymmetric_friction"
     refines: ClassVar[tuple[str, ...]] = ("coulomb_friction", "viscous_damping")
     independent: ClassVar[bool] = True
-    elements: ClassVar[tuple[str, ...]] = ("joint",)
     law: ClassVar[str] = "τ = −(τ₊ + c₊·q̇) for q̇ > 0, τ₋ − c₋·q̇ for q̇ < 0"
     identified_by: ClassVar[str] = "constant-speed runs in both directions, and rests between them"
-    acts: ClassVar[bool] = True
-    reads_state: ClassVar[bool] = True
 
     coulomb_positive: jax.Array = parameter(
         0.0, unit="N m", low=0.0, high=50.0, scale=1e-3, source="As coulomb_friction"
@@ -182,29 +208,30 @@ class AsymmetricFriction(Effect):
         source="As viscous_damping",
     )
 
-    def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Make the compiler reserve the friction constraint's row."""
-        reserve_row(spec, self.name)
+    def steady(self) -> jax.Array:
+        """Return the mean of both directions."""
+        return 0.5 * (self.coulomb_positive + self.coulomb_negative)
+
+    def friction(self, model: ModelView, state, ctrl: jax.Array) -> jax.Array:
+        """Return that of the direction of motion."""
+        del ctrl
+        positive = state.qvel[_dof(model.host, self.name)] > 0
+        return jnp.where(positive, self.coulomb_positive, self.coulomb_negative)
 
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
-        """Add the mean dry friction and the smaller damping of both directions."""
-        dof = _dof(model.host, self.name)
-        dry = 0.5 * (self.coulomb_positive + self.coulomb_negative)
+        """Add the smaller damping of both directions."""
         viscous = jnp.minimum(self.viscous_positive, self.viscous_negative)
-        return {
-            "dof_frictionloss": model["dof_frictionloss"].at[dof].add(dry),
-            "dof_damping": model["dof_damping"].at[dof].add(viscous),
-        }
+        dof = _dof(model.host, self.name)
+        return {"dof_damping": model["dof_damping"].at[dof].add(viscous)}
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
-        """Add half of the dry difference, and what the larger damping has more."""
+        """Take what the larger damping has more."""
         joint = element_id(model.host, "joint", self.name)
         dof = _dof(model.host, self.name)
         speed = state.qvel[dof]
-        dry = 0.5 * (self.coulomb_negative - self.coulomb_positive)
         there = jnp.where(speed > 0, self.viscous_positive, self.viscous_negative)
         more = there - jnp.minimum(self.viscous_positive, self.viscous_negative)
-        torque = along_motion(model, dof, speed, dry) - _drag(model, dof, speed, more)
+        torque = -_drag(model, dof, speed, more)
         return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
 
     def export(self, spec: mujoco.MjSpec) -> str:
@@ -218,24 +245,18 @@ class AsymmetricFriction(Effect):
 
 
 @struct.dataclass
-class StribeckFriction(Effect):
+class StribeckFriction(VaryingFriction):
     """Dry friction that is larger at rest than in motion.
 
     |τ| = τ_c + (τ_s − τ_c)·exp(−(q̇/v_s)²), against the motion; `static` below `coulomb` counts as
-    equal to it. The friction row has the static size, which holds at rest; in motion a force along
-    it takes away what friction loses. That force is bounded near rest (see the module), so
-    a v_s below 2·(τ_s − τ_c)/k, with the row's steepness k, is felt as that speed. Shows as
-    stick-slip in slow motion and a jump at breakaway. Typical: τ_s = 1.2 to 2 τ_c and v_s = 0.01 to
-    0.1 rad/s (Armstrong-Hélouvry, Dupont and Canudas de Wit 1994).
+    equal to it. Shows as stick-slip in slow motion and a jump at breakaway. Typical: τ_s = 1.2 to
+    2 τ_c and v_s = 0.01 to 0.1 rad/s (Armstrong-Hélouvry, Dupont and Canudas de Wit 1994).
     """
 
     kind: ClassVar[str] = "stribeck_friction"
     refines: ClassVar[tuple[str, ...]] = ("coulomb_friction",)
-    elements: ClassVar[tuple[str, ...]] = ("joint",)
     law: ClassVar[str] = "|τ| = τ_c + (τ_s − τ_c)·exp(−(q̇/v_s)²), against the motion"
     identified_by: ClassVar[str] = "constant-speed runs from below v_s up; slow ramps from rest"
-    acts: ClassVar[bool] = True
-    reads_state: ClassVar[bool] = True
 
     coulomb: jax.Array = parameter(
         0.0, unit="N m", low=0.0, high=50.0, scale=1e-3, source="As coulomb_friction"
@@ -272,29 +293,15 @@ class StribeckFriction(Effect):
         size = float(getattr(simpler, simpler.parameters()[0].name))
         return {"coulomb": size, "static": 1.5 * size, "velocity": 0.1}
 
-    @property
-    def excess(self) -> jax.Array:
-        """Static beyond Coulomb friction, N m, []."""
-        return jnp.maximum(jnp.asarray(self.static) - self.coulomb, 0.0)
+    def steady(self) -> jax.Array:
+        """Return the Coulomb friction."""
+        return jnp.asarray(self.coulomb)
 
-    def prepare(self, spec: mujoco.MjSpec) -> None:
-        """Make the compiler reserve the friction constraint's row."""
-        reserve_row(spec, self.name)
-
-    def fields(self, model: ModelView) -> dict[str, jax.Array]:
-        """Add the friction at rest to the joint's friction loss."""
-        dof = _dof(model.host, self.name)
-        at_rest = self.coulomb + self.excess
-        return {"dof_frictionloss": model["dof_frictionloss"].at[dof].add(at_rest)}
-
-    def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
-        """Take away in motion what friction loses with speed."""
-        joint = element_id(model.host, "joint", self.name)
-        dof = _dof(model.host, self.name)
-        speed = state.qvel[dof]
-        lost = -self.excess * jnp.expm1(-((speed / self.velocity) ** 2)) * jnp.sign(speed)
-        torque = along_motion(model, dof, speed, lost)
-        return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
+    def friction(self, model: ModelView, state, ctrl: jax.Array) -> jax.Array:
+        """Return the friction at the present speed."""
+        del ctrl
+        share = jnp.exp(-((state.qvel[_dof(model.host, self.name)] / self.velocity) ** 2))
+        return self.coulomb + jnp.maximum(jnp.asarray(self.static) - self.coulomb, 0.0) * share
 
     def export(self, spec: mujoco.MjSpec) -> str:
         """Write the friction in motion."""
@@ -303,13 +310,11 @@ class StribeckFriction(Effect):
 
 
 @struct.dataclass
-class LoadFriction(Effect):
+class LoadFriction(VaryingFriction):
     """Dry friction in proportion to the torque that the joint's actuators transmit.
 
     |τ| ≤ μ·|τ_a|, against the motion, with τ_a the actuators' torque at the joint as the model has
-    it. A gear gives (1 − μ) of the torque when it drives and (1 + μ) when it is driven back. Near
-    rest the law is linear in speed, as steep as is stable: half of inertia I over timestep h; under
-    a torque τ that it could hold a joint creeps at 2·h·τ/I (0.04 rad/s for 10 rad/s² at 2 ms).
+    it. A gear gives (1 − μ) of the torque when it drives and (1 + μ) when it is driven back.
     Commands are seen as the effects listed before this one leave them. Shows as friction that grows
     with load, at every speed. Typical: 1 minus a gear's efficiency: 0.02 for spur gears, 0.1 to 0.3
     for harmonic drives, above 0.5 for worm gears; Duclusaud et al. 2024 (arXiv 2410.08650) have the
@@ -317,12 +322,9 @@ class LoadFriction(Effect):
     """
 
     kind: ClassVar[str] = "load_friction"
-    elements: ClassVar[tuple[str, ...]] = ("joint",)
     needs: ClassVar[str] = "a joint whose actuators are motors or servos without dynamics"
     law: ClassVar[str] = "|τ| ≤ μ·|τ_a(u, q, q̇)|, against the motion"
     identified_by: ClassVar[str] = "lifting and lowering the same load at several weights"
-    acts: ClassVar[bool] = True
-    reads_state: ClassVar[bool] = True
 
     ratio: jax.Array = parameter(
         0.0,
@@ -338,15 +340,12 @@ class LoadFriction(Effect):
         """Say whether the joint has actuators, of kinds whose torque is known."""
         return super().fits(host, element, name) and is_driven(host, name)
 
-    def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
-        """Add the friction under the present torque."""
+    def friction(self, model: ModelView, state, ctrl: jax.Array) -> jax.Array:
+        """Return the friction under the present torque."""
         host = model.host
-        joint, dof = element_id(host, "joint", self.name), _dof(host, self.name)
-        angle, speed = state.qpos[host.jnt_qposadr[joint]], state.qvel[dof]
-        size = self.ratio * jnp.abs(actuator_torque(model, joint, angle, speed, ctrl))
-        steepness = 0.5 * felt_inertia(model, dof) / host.opt.timestep
-        torque = -jnp.clip(steepness * speed, -size, size)
-        return ctrl, at_dof(host, joint, torque, ctrl.dtype), memory
+        joint = element_id(host, "joint", self.name)
+        angle, speed = state.qpos[host.jnt_qposadr[joint]], state.qvel[_dof(host, self.name)]
+        return self.ratio * jnp.abs(actuator_torque(model, joint, angle, speed, ctrl))
 
 
 @struct.dataclass
