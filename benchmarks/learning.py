@@ -13,9 +13,11 @@ solve. `--extend` keeps the rows of the result file and adds what it lacks; each
 import concurrent.futures
 import dataclasses
 import importlib.metadata
+import itertools
 import json
 import multiprocessing
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -158,23 +160,26 @@ def row_of(
     return row
 
 
+def _key(row: dict[str, Any]) -> tuple[str, str, float]:
+    return row["env"], row["agent"], row["max_kl"]
+
+
 def recorded_rows(arguments: Arguments) -> Kept:
     """Return the rows of the result file with as many seeds and steps."""
     path = arguments.out / f"{NAME}.json"
     result = json.loads(path.read_text(encoding="utf-8"))
     return {
-        (row["env"], row["agent"], row["max_kl"]): row
+        _key(row): row
         for row in [*result["rows"], *result["targets"]]
         if row["steps"][-1] == arguments.steps and len(row["solved"]) == arguments.seeds
     }
 
 
-def measure(arguments: Arguments, kept: Kept) -> list[dict[str, Any]]:
-    """Return a row for each world, agent and trust region."""
+def measure(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]]:
+    """Yield a row for each world, agent and trust region."""
     seeds, steps = arguments.seeds, arguments.steps
     worlds = {name: host_world(name) for name in arguments.envs}
     sides = [(name, world, config) for name, world in worlds.items() for config in configs(world)]
-    rows = []
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(arguments.jobs, mp_context=context) as pool:
         peers = {
@@ -192,46 +197,50 @@ def measure(arguments: Arguments, kept: Kept) -> list[dict[str, Any]]:
                 returns = np.asarray([future.result() for future in peers[name, config]]).T
                 theirs = row_of(name, PEER, config, solved, returns, steps)
             least = theirs["mean"] - WITHIN * abs(theirs["mean"])
-            rows += [theirs, ours | {"met": ours["mean"] >= least}]
-    return rows
+            yield theirs
+            yield ours | {"met": ours["mean"] >= least}
 
 
-def measure_targets(arguments: Arguments, kept: Kept) -> list[dict[str, Any]]:
-    """Return a row for each pair's target."""
-    config, rows = TRPOConfig(), []
+def measure_targets(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]]:
+    """Yield a row for each pair's target."""
+    config = TRPOConfig()
     for name in arguments.pairs:
         _, target = PAIRS[name].worlds("mujoco")
-        rows.append(
-            kept.get((name, OURS, config.max_kl))
-            or row_of(
-                name,
-                OURS,
-                config,
-                target.env.task.solved_return,
-                learn(target, config, arguments.seeds, arguments.steps),
-                arguments.steps,
-            )
+        solved = target.env.task.solved_return
+        yield kept.get((name, OURS, config.max_kl)) or row_of(
+            name,
+            OURS,
+            config,
+            solved,
+            learn(target, config, arguments.seeds, arguments.steps),
+            arguments.steps,
         )
-    return rows
+
+
+def write(arguments: Arguments, rows: list[dict[str, Any]]) -> Path:
+    """Write all rows so far."""
+    details = {
+        "peer": {k: importlib.metadata.version(k) for k in ("sb3-contrib", "torch")},
+        "within": WITHIN,
+        "episodes": EPISODES,
+        "targets": [row for row in rows if row["env"] in PAIRS],
+    }
+    rows = [row for row in rows if row["env"] in ENVS]
+    command, seeds = command_line(), range(arguments.seeds)
+    return write_result(
+        NAME, rows, seeds=seeds, command=command, details=details, folder=arguments.out
+    )
 
 
 def main() -> None:
     arguments = tyro.cli(Arguments)
     kept = recorded_rows(arguments) if arguments.extend else {}
-    rows, targets = measure(arguments, kept), measure_targets(arguments, kept)
-    details = {
-        "peer": {k: importlib.metadata.version(k) for k in ("sb3-contrib", "torch")},
-        "within": WITHIN,
-        "episodes": EPISODES,
-        "targets": targets,
-    }
-    command = command_line()
-    seeds = range(arguments.seeds)
-    print(
-        write_result(
-            NAME, rows, seeds=seeds, command=command, details=details, folder=arguments.out
-        )
-    )
+    rows: list[dict[str, Any]] = []
+    for row in itertools.chain(measure(arguments, kept), measure_targets(arguments, kept)):
+        rows.append(row)
+        kept.pop(_key(row), None)
+        path = write(arguments, [*rows, *kept.values()])  # an interrupted run loses nothing
+        print(path, flush=True)
 
 
 if __name__ == "__main__":
