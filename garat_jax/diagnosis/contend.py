@@ -19,6 +19,9 @@ CONTENDERS = 4
 """How many candidates are fitted each round, besides those that are like the first."""
 SAME = 1.0 - 1e-9
 """Cosine of two candidates' changes from which they are one change."""
+FIRM = 2.0
+"""Half-widths of its 95 % interval by which a parameter that screening left out must differ from no
+effect, to be fitted in the end."""
 HOPELESS = 8.0
 """What a candidate is expected to leave unexplained, relative to what the best one left when it was
 fitted, above which it is not fitted; the runner-up always is."""
@@ -120,6 +123,38 @@ def fit_further(problem: Problem, best: Contender, say: Callable[[str], None]) -
     fitted = fit(problem, best.fit.theta, start, free, sensitivity=sensitivity)
     score = dataclasses.replace(best.score, columns=(*best.score.columns, *further))
     return [Contender(score, fitted)]
+
+
+def complete(problem: Problem, best: Contender, say: Callable[[str], None]) -> Contender:
+    """Return a contender with those further parameters of its law that are firmly not nil.
+
+    However little such a parameter explains, without it the others make up for it.
+    """
+    for fuller in fit_further(problem, best, say):
+        firm = [
+            j
+            for j in fuller.score.columns
+            if j in best.score.columns or _is_firm(problem, fuller.fit, j)
+        ]
+        if len(firm) == len(fuller.score.columns):
+            return fuller
+        if len(firm) > len(best.score.columns):
+            left_out = [j for j in fuller.score.columns if j not in firm]
+            theta = fuller.fit.theta.copy()
+            theta[left_out] = best.fit.theta[left_out]
+            free = [j for j in fuller.fit.free if j not in left_out]
+            start, sensitivity = fuller.fit.start, fuller.fit.sensitivity
+            fitted = fit(problem, theta, start, free, sensitivity=sensitivity)
+            return Contender(dataclasses.replace(best.score, columns=tuple(firm)), fitted)
+    return best
+
+
+def _is_firm(problem: Problem, fitted: Fit, column: int) -> bool:
+    """Say whether a fitted parameter differs from no effect by far."""
+    place = fitted.free.index(column)
+    half = 0.5 * (fitted.high[place] - fitted.low[place])
+    off = abs(fitted.theta[column] - problem.simulator.base[column])
+    return bool(off > FIRM * half)
 
 
 def with_twins(

@@ -13,6 +13,7 @@ import numpy as np
 
 from garat_jax.diagnosis.contend import (
     Contender,
+    complete,
     fit_contenders,
     fit_further,
     fit_refinements,
@@ -103,7 +104,8 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         best = contender.fit if contender is not None else best
         if candidate is None or contender is None or not candidate.passes:
             break
-        current, added = contender.fit, contender
+        added = complete(problem, contender, say)
+        current = added.fit
         steps.append(Step(candidate, contender.score.effect, current))
         steps, current = _prune(problem, before, steps, current, say)
         floor = noise_floor(problem, metric, current)

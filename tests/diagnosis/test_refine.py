@@ -39,6 +39,18 @@ def test_constant_dry_friction_is_not_refined():
     assert found.parameters["torque"].estimate == pytest.approx(COULOMB, rel=0.05)
 
 
+def test_a_parameter_that_explains_little_is_fitted_all_the_same():
+    drag = 0.0015  # N m s/rad in the direction in which most of the friction is dry
+
+    def law(speed: float) -> float:
+        return -0.04 - (drag if speed > 0 else 20 * drag) * speed
+
+    (found,) = found_with(0.08, law).selected
+    assert found.effect == "asymmetric_friction"
+    estimate = found.parameters["viscous_positive"]
+    assert 0.0 < estimate.low <= drag <= estimate.high
+
+
 def test_damping_with_a_little_dry_friction_is_not_called_asymmetric():
     model = dataclasses.replace(MODEL, catalogue={kind: CATALOGUE[kind] for kind in KINDS})
 
