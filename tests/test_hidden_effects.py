@@ -23,7 +23,8 @@ from benchmarks.hidden.measure import experiment, measure
 from benchmarks.hidden.robots import ROBOTS
 from benchmarks.hidden.score import NOT_YET, aggregate, score
 from benchmarks.hidden.secrets import OUTSIDE, SIZES
-from garat_jax.diagnosis import Recording
+from garat_jax.diagnosis import Recording, diagnose, load_model
+from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.results import Candidate, Estimate, Interval, Named
 
 SCENES = Surveys()
@@ -197,6 +198,21 @@ def test_a_set_is_drawn_from_its_seed_and_reads_as_recordings(tmp_path):
     assert not any(warning for r in recordings for warning in r.warnings)
     written = json.loads((tmp_path / "truth.json").read_text())
     assert written["secrets"][0]["parameters"] == dict(truth.secrets[0].parameters)
+
+
+@pytest.mark.slow
+def test_two_effects_of_which_neither_leads_by_itself_are_found_together(tmp_path):
+    case = next(c for c in list_cases(0) if c.name == "pair-02-air_drag+load_friction")
+    truth = draw(case, SCENES)
+    paths = generate(truth, SCENES[truth.robot], tmp_path)
+    model = load_model(tmp_path / f"{truth.robot}.xml")
+    fitted, held_out = read_recordings(model, paths[:-1]), read_recordings(model, paths[-1:])
+    found = diagnose(model, fitted, held_out)
+    assert "together with air_drag" in found.selected[0].why
+    for effect, secret in zip(found.selected, reversed(truth.secrets), strict=True):
+        ((name, true),) = secret.parameters.items()
+        assert (effect.effect, effect.target) == (secret.kind, secret.target)
+        assert effect.parameters[name].estimate == pytest.approx(true, rel=0.05)
 
 
 def candidate(effect: str, target: str, alike=(), **parameters) -> Candidate:

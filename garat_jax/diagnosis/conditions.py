@@ -14,10 +14,10 @@ import numpy as np
 
 from garat_jax.diagnosis.diagnose import choose_horizon, diagnose, split, thin
 from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import estimates
 from garat_jax.diagnosis.results import Candidate, Diagnosis
 from garat_jax.diagnosis.segments import Segments, choose_grid
 from garat_jax.diagnosis.simulate import Simulator, Slot

@@ -1,0 +1,202 @@
+"""Hold fitted candidates against each other, and say which passes every gate."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from garat_jax.diagnosis.contend import Contender
+from garat_jax.diagnosis.fit import Fit, count_timestep
+from garat_jax.diagnosis.metric import Metric
+from garat_jax.diagnosis.problem import Problem, block_labels
+from garat_jax.diagnosis.results import Candidate, Estimate, Interval, Named
+from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
+from garat_jax.effects.base import unit_at
+
+SMALLEST_SHARE = 0.05
+"""Share of the residual that an effect must explain."""
+SIGNIFICANCE = 0.01
+"""Largest corrected p-value."""
+STABLE = 0.8
+"""Share of block resamples in which an effect must be first."""
+TOO_CLOSE = 1.05
+"""Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
+NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
+RESAMPLES = 500
+
+Judged = list[tuple[Candidate, Contender | None]]
+"""Candidates, best first, each with its fit if it was fitted."""
+
+
+def judge(
+    problem, metric: Metric, current: Fit, scores, contenders: list[Contender], gap: bool
+) -> Judged:
+    """Return every score's candidate, with its contender if it was fitted, best first."""
+    judged = []
+    if contenders:
+        costs = _block_costs(problem, 1.0, [c.fit for c in contenders], slice(None))
+        num_blocks = costs.shape[1]
+        penalty = [len(c.score.columns) * np.log(num_blocks) / num_blocks for c in contenders]
+        criterion = np.log(costs.sum(axis=1)) + penalty
+        drawn = np.log(_resamples(num_blocks) @ costs.T) + penalty
+        for index in np.argsort(criterion):
+            judged.append(_judge_one(problem, metric, current, contenders, int(index), drawn))
+        judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
+        if judged[0][0].passes:
+            judged = _with_timestep(problem, metric, judged)
+    fitted = [c.score.effect for c in contenders]
+    near = "the model's error is near the noise floor" if not gap else "others explain more"
+    for score in scores:
+        if score.effect not in fitted:
+            sign = "its sign is physically impossible" if not score.possible else near
+            judged.append((_unfitted(problem, score, score.excluded or sign), None))
+    return judged
+
+
+def _with_timestep(problem: Problem, metric: Metric, judged):
+    """Show the first candidate, and those like it, as a timestep of 0 would have them.
+
+    Candidates are held against each other, and added to, as they fit at the model's own.
+    """
+    shown = {judged[0][0].named, *judged[0][0].indistinguishable_from}
+    for place, (candidate, contender) in enumerate(judged):
+        if candidate.named in shown:
+            fit = count_timestep(problem, contender.fit)
+            candidate = dataclasses.replace(
+                candidate,
+                parameters=estimates(problem, contender.score.effect, fit),
+                error_after=metric.error(fit.residual, ~problem.fitted),
+            )
+            judged[place] = (candidate, dataclasses.replace(contender, timeless=fit))
+    return judged
+
+
+def _alike(contenders: list[Contender], current: Fit, drawn: np.ndarray, index: int) -> list[int]:
+    """Return the contenders that these recordings cannot tell from one of them."""
+    change = [(c.fit.residual - current.residual).ravel() for c in contenders]
+    size = [float(np.linalg.norm(c)) or 1.0 for c in change]
+    alike = []
+    for other in range(len(contenders)):
+        if other == index:
+            continue
+        same = cosine(contenders[index].score, contenders[other].score)
+        same = max(same, abs(float(change[index] @ change[other])) / (size[index] * size[other]))
+        lead = np.quantile(drawn[:, other] - drawn[:, index], [0.025, 0.5, 0.975])
+        close = lead[0] < 0 < lead[2] or abs(lead[1]) < np.log(TOO_CLOSE)
+        if same > EQUIVALENT and close:
+            alike.append(other)
+    return alike
+
+
+def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, drawn):
+    contender, held_out = contenders[index], ~problem.fitted
+    alike = _alike(contenders, current, drawn, index)
+    others = [i for i in range(len(contenders)) if i != index and i not in alike]
+    stability = float(np.mean(np.isin(drawn.argmin(axis=1), [index, *alike])))
+    lead = np.inf
+    if others:
+        lead = float(np.quantile(drawn[:, others].min(axis=1) - drawn[:, index], 0.025))
+    gain = _gain(problem, metric, current, contender.fit, held_out)
+    share = 1.0 - contender.fit.cost[problem.fitted].sum() / current.cost[problem.fitted].sum()
+    why = _failed_gate(contender.score, share, gain, lead, stability)
+    effects = problem.simulator.effects
+    named = [effects[contenders[i].score.effect] for i in alike]
+    candidate = Candidate(
+        effect=effects[contender.score.effect].kind,
+        target=effects[contender.score.effect].target,
+        parameters=estimates(problem, contender.score.effect, contender.fit),
+        share=float(share),
+        p_value=contender.score.p_value,
+        error_after=metric.error(contender.fit.residual, held_out),
+        held_out_gain=gain,
+        stability=stability,
+        indistinguishable_from=tuple(Named(e.kind, e.target) for e in named),
+        passes=not why,
+        why=why or "passes every gate",
+    )
+    return candidate, contender
+
+
+def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stability: float) -> str:
+    """Return the first gate that is failed, or an empty string."""
+    if score.p_value > SIGNIFICANCE:
+        return f"not significant (corrected p = {score.p_value:.2g})"
+    if share < SMALLEST_SHARE:
+        return f"explains only {100 * share:.1f} % of the residual"
+    if gain.low <= 0:
+        return "the held-out error does not fall for certain"
+    if lead <= 0:
+        return NO_CERTAIN_LEAD
+    if stability < STABLE:
+        return f"first in only {100 * stability:.0f} % of the resamples"
+    return ""
+
+
+def _gain(problem, metric: Metric, before: Fit, after: Fit, held_out) -> Interval:
+    """Return the fall of the held-out error with a block-bootstrap interval."""
+    costs = _block_costs(problem, metric.weight, [before, after], held_out)
+    count = metric.count(held_out)
+    drawn = np.sqrt(_resamples(costs.shape[1]) @ costs.T / count)
+    whole = np.sqrt(costs.sum(axis=1) / count)
+    low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [0.025, 0.975])
+    return Interval(float(whole[0] - whole[1]), float(low), float(high))
+
+
+def estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate]:
+    """Return the fitted parameters of an effect, and those set to another than no effect's."""
+    simulator = problem.simulator
+    estimates = {}
+    for j, slot in enumerate(simulator.slots):
+        if slot.effect != effect:
+            continue
+        unit = unit_at(slot.parameter, simulator.host, simulator.effects[effect].target)
+        if j in fitted.free and j not in fitted.frozen:
+            at = fitted.free.index(j)
+            low, high = float(fitted.low[at]), float(fitted.high[at])
+            estimates[slot.parameter.name] = Estimate(float(fitted.theta[j]), low, high, unit)
+        elif fitted.theta[j] != slot.parameter.nominal:
+            value = float(fitted.theta[j])
+            estimates[slot.parameter.name] = Estimate(value, float("nan"), float("nan"), unit)
+    return estimates
+
+
+def _unfitted(problem: Problem, score: Score, why: str) -> Candidate:
+    simulator, nan = problem.simulator, float("nan")
+    effect = simulator.effects[score.effect]
+    parameters = {}
+    for j, size in zip(score.columns, score.size, strict=False):
+        p = simulator.slots[j].parameter
+        parameters[p.name] = Estimate(size, nan, nan, unit_at(p, simulator.host, effect.target))
+    return Candidate(
+        effect=effect.kind,
+        target=effect.target,
+        parameters=parameters,
+        share=score.share,
+        p_value=score.p_value,
+        error_after=nan,
+        held_out_gain=Interval(nan, nan, nan),
+        stability=0.0,
+        indistinguishable_from=(),
+        passes=False,
+        why=why,
+    )
+
+
+def leads(problem: Problem, first: Fit, second: Fit) -> bool:
+    """Say whether one fit's cost is certainly lower than another's, by more than a trifle."""
+    costs = _block_costs(problem, 1.0, [first, second], slice(None))
+    drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
+    lead = drawn[:, 1] - drawn[:, 0]
+    return bool(np.quantile(lead, 0.025) > 0 and np.median(lead) > np.log(TOO_CLOSE))
+
+
+def _block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):
+    """Return each fit's cost in each block of the chosen segments, [num_fits, num_blocks]."""
+    labels = np.unique(block_labels(problem)[chosen].ravel(), return_inverse=True)[1]
+    return np.stack([np.bincount(labels, (f.residual[chosen] ** 2 * weight).ravel()) for f in fits])
+
+
+def _resamples(num_blocks: int) -> np.ndarray:
+    """Return how often each block is drawn, [RESAMPLES, num_blocks]."""
+    rng = np.random.default_rng(0)
+    return rng.multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), RESAMPLES)
