@@ -2,6 +2,7 @@
 
 import warnings
 
+import distrax
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ with warnings.catch_warnings():  # torch's own deprecations
     sb3 = pytest.importorskip("stable_baselines3", reason=REASON)
     contrib = pytest.importorskip("sb3_contrib", reason=REASON)
     import torch
+    from stable_baselines3.common.distributions import DiagGaussianDistribution, kl_divergence
     from stable_baselines3.common.env_checker import check_env
     from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
@@ -80,3 +82,18 @@ def test_trpo_learns_with_our_hyper_parameters():
         learner.learn(torch_peers.BATCH, log_interval=None, reset_num_timesteps=False)
         lengths.append(np.mean([episode["l"] for episode in learner.ep_info_buffer]))
     assert lengths[-1] > 1.5 * lengths[0]
+
+
+def test_the_peer_averages_over_the_actions_what_ours_sums():
+    means, spreads = np.array([[0.1, -0.4, 0.3], [0.0, 0.2, -0.1]]), np.array([1.0, 0.5, 2.0])
+
+    def theirs(mean):
+        log_std = torch.log(torch.as_tensor(spreads))
+        return DiagGaussianDistribution(3).proba_distribution(torch.as_tensor(mean), log_std)
+
+    def ours(mean):
+        return distrax.MultivariateNormalDiag(mean, np.broadcast_to(spreads, mean.shape))
+
+    averaged = kl_divergence(theirs(means), theirs(0 * means)).mean()
+    summed = ours(means).kl_divergence(ours(0 * means)).mean()
+    assert float(averaged) == pytest.approx(float(summed) / 3, rel=1e-5)

@@ -113,16 +113,14 @@ def learning() -> str:
 
 
 def _learning(result: dict[str, Any]) -> str:
-    """One row a world and agent: mean returns at each point of the training."""
+    """One row a world, trust region and agent: mean returns at each point of the training."""
     lines = [
         (
-            f"{WORLDS[row['env']]}, {row['agent']}",
+            f"{WORLDS[row['env']]}, KL ≤ {row['max_kl']:g}, {row['agent']}",
             *(f"{sum(returns) / len(returns):,.0f}" for returns in row["returns"][:-1]),
             f"**{row['mean']:,.0f} ± {row['standard_error']:,.0f}**",
         )
-        for name in dict.fromkeys(row["env"] for row in result["rows"])
         for row in result["rows"]
-        if row["env"] == name
     ]
     steps = [f"{steps:,} steps" for steps in result["rows"][0]["steps"]]
     return table(("mean return", *steps), lines)
