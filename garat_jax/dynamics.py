@@ -134,10 +134,12 @@ def view(dynamics: Dynamics) -> ModelView:
 def native_model(dynamics: Dynamics) -> mujoco.MjModel:
     """Return a MuJoCo model with the native fields of the effects written into it.
 
-    What effects do to commands and by forces is not in it: no MuJoCo field says that.
+    What effects do to commands and by forces is not in it: no MuJoCo field says that. Of a field
+    that changes with the state it has the part that does not.
     """
     model = copy.copy(dynamics.host.model)
-    changed = view(dynamics).changed
+    steady = dynamics.replace(effects=tuple(effect.along_path() for effect in dynamics.effects))
+    changed = view(steady).changed
     for name, value in changed.items():
         owner, _, field = name.rpartition(".")
         getattr(model.opt if owner else model, field)[...] = np.asarray(value)

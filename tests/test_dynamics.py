@@ -13,7 +13,14 @@ import pytest
 
 from garat_jax import dynamics
 from garat_jax.dynamics import Override
-from garat_jax.effects import CATALOGUE, ActuatorDelay, PayloadMass, RotorInertia, ViscousDamping
+from garat_jax.effects import (
+    CATALOGUE,
+    ActuatorDelay,
+    AsymmetricFriction,
+    PayloadMass,
+    RotorInertia,
+    ViscousDamping,
+)
 from garat_jax.errors import UserError
 from garat_jax.setconst import set_const
 from tests.models import ARM, MUSCLE, PENDULUM, TUMBLER, showing, spec
@@ -343,6 +350,12 @@ def test_the_native_model_is_what_the_engine_steps():
     state = dynamics.step(world, state, jnp.zeros(model.nu), 5)
     np.testing.assert_allclose(state.qpos, data.qpos, rtol=1e-9)
     assert dynamics.view(world).host.body("forearm_payload").mass[0] < 1e-8
+
+
+def test_the_native_model_has_the_steady_part_of_a_varying_friction():
+    effect = AsymmetricFriction("joint/hinge", coulomb_positive=0.3, coulomb_negative=0.1)
+    model = dynamics.native_model(compiled(PENDULUM, effect, engine="mujoco"))
+    assert model.dof_frictionloss[0] == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("driven", [True, False])
