@@ -165,14 +165,18 @@ def _key(row: dict[str, Any]) -> tuple[str, str, float]:
 
 
 def recorded_rows(arguments: Arguments) -> Kept:
-    """Return the rows of the result file with as many seeds and steps."""
+    """Return the rows of the result file.
+
+    Raises:
+        SystemExit: They have another number of seeds or steps.
+    """
     path = arguments.out / f"{NAME}.json"
     result = json.loads(path.read_text(encoding="utf-8"))
-    return {
-        _key(row): row
-        for row in [*result["rows"], *result["targets"]]
-        if row["steps"][-1] == arguments.steps and len(row["solved"]) == arguments.seeds
-    }
+    rows = [*result["rows"], *result["targets"]]
+    sizes = {(len(row["solved"]), row["steps"][-1]) for row in rows}
+    if sizes - {(arguments.seeds, arguments.steps)}:
+        raise SystemExit(f"--extend: {path} has (seeds, steps) {sorted(sizes)}; give the same")
+    return {_key(row): row for row in rows}
 
 
 def measure(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]]:
@@ -239,7 +243,7 @@ def main() -> None:
     for row in itertools.chain(measure(arguments, kept), measure_targets(arguments, kept)):
         rows.append(row)
         kept.pop(_key(row), None)
-        path = write(arguments, [*rows, *kept.values()])  # an interrupted run loses nothing
+        path = write(arguments, [*rows, *kept.values()])  # so that --extend can go on from here
         print(path, flush=True)
 
 

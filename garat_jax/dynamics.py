@@ -209,7 +209,7 @@ def move(
 
     def substep(state: PhysicsState, _):
         tuned, command, force, memory = _act(dynamics, model, state, ctrl, state.memory)
-        now = constants if tuned is model else _constants(dynamics, tuned)
+        now = _tuned(dynamics, constants, model, tuned)
         state = _advance(dynamics, now, state, command[None], force[None], 1)
         return state._replace(memory=memory), None
 
@@ -333,6 +333,14 @@ def _constants(dynamics: Dynamics, model: ModelView) -> Any:
     if CONSTANT_INPUTS & fields.keys():
         changed = set_const(changed, dynamics.host.model)
     return changed
+
+
+def _tuned(dynamics: Dynamics, constants: Any, model: ModelView, tuned: ModelView) -> Any:
+    """Return `constants` with the fields that `Effect.tune` has replaced."""
+    fields = {n: v for n, v in tuned.changed.items() if model.changed.get(n) is not v}
+    if dynamics.engine == "mujoco":
+        return {**constants, **fields}
+    return constants.replace(**fields)
 
 
 def _advance(

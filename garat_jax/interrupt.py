@@ -77,16 +77,20 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread receives signals
+    """Handle Ctrl-C; not where it is ignored, as in a script's background, nor in a thread."""
+    is_main = threading.current_thread() is threading.main_thread()
+    previous = signal.getsignal(signal.SIGINT)
+    if not is_main or previous in (signal.SIG_IGN, None):
+        yield
         return
-    previous = signal.signal(signal.SIGINT, handler)
+    signal.signal(signal.SIGINT, handler)
     try:
         yield
+        raise_held()
     except RuntimeError as error:  # XLA's, of what `raise_held` raised
         if not _held.is_set():
             raise
         raise KeyboardInterrupt from error
     finally:
-        _held.clear()
         signal.signal(signal.SIGINT, previous)
+        _held.clear()

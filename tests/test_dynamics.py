@@ -321,13 +321,13 @@ def interrupt():
         os.kill(os.getpid(), signal.SIGINT)
 
 thread = threading.Thread(target=interrupt, daemon=True)
-signal.signal(signal.SIGINT, signal.SIG_IGN)  # but for the block
 try:
     with interruptible():
         thread.start()
         while True:
             jax.block_until_ready(run(states))
 except KeyboardInterrupt:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     print("stopped")
     thread.join()
 """

@@ -32,6 +32,12 @@ def origin(name: str, result: dict[str, Any]) -> str:
     )
 
 
+def commits(rows: Sequence[dict[str, Any]]) -> str:
+    """Say of which commits rows are, where they are of several."""
+    found = sorted({row["commit"][:7] for row in rows})
+    return f"\nThe rows are of the commits {', '.join(found)}.\n" if len(found) > 1 else ""
+
+
 def if_measured(make: Callable[[dict[str, Any]], str], name: str, part: str = "rows") -> str:
     """Return a table with its origin, or that a file or this part of it is not there yet."""
     if exists(name) and part in (result := read(name)):

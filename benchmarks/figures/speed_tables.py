@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from results import ENGINES, ROOT, if_measured, table
+from results import ENGINES, ROOT, commits, if_measured, table
 
 WORLDS = {
     "inverted_pendulum": "InvertedPendulum",
@@ -123,7 +123,7 @@ def _learning(result: dict[str, Any]) -> str:
         for row in result["rows"]
     ]
     steps = [f"{steps:,} steps" for steps in result["rows"][0]["steps"]]
-    return table(("mean return", *steps), lines)
+    return table(("mean return", *steps), lines) + commits(result["rows"])
 
 
 def targets() -> str:
@@ -142,7 +142,8 @@ def _targets(result: dict[str, Any]) -> str:
         for row in result["targets"]
     ]
     steps = [f"{steps:,} steps" for steps in result["targets"][0]["steps"]]
-    return table(("target of", *steps, "solved from", "seeds that solve it"), lines)
+    columns = ("target of", *steps, "solved from", "seeds that solve it")
+    return table(columns, lines) + commits(result["targets"])
 
 
 def start() -> str:

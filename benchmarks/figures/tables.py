@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import speed_tables
 import tyro
-from results import ENGINES, ROOT, if_measured, origin, read, table
+from results import ENGINES, ROOT, commits, if_measured, origin, read, table
 
 BLOCK = re.compile(r"(<!-- table (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -142,11 +142,8 @@ def _hidden_effects(result: dict[str, Any]) -> str:
         f"{result['seeds'][0]}; a set took {seconds['value']:.0f} s (median), at most "
         f"{seconds['largest']:.0f} s. The result file names the sets that fall short.\n"
     )
-    commits = sorted({row["commit"][:7] for row in result["rows"]})
-    if len(commits) > 1:
-        text += f"Sets were diagnosed at the commits {', '.join(commits)}.\n"
     columns = ("measure", "share", "95 % interval", "of", "held to")
-    return table(columns, lines) + text
+    return table(columns, lines) + text + commits(result["rows"])
 
 
 def _span(low: float, high: float) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from garat_jax.diagnosis.evidence import Evidence
-from garat_jax.diagnosis.fit import Fit, fit
+from garat_jax.diagnosis.fit import Fit, count_timestep, fit
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import EQUIVALENT, VISIBLE, Score, cosine, simpler_law
 from garat_jax.diagnosis.simulate import columns_of
@@ -21,7 +21,7 @@ SAME = 1.0 - 1e-9
 """Cosine of two candidates' changes from which they are one change."""
 FIRM = 2.0
 """Half-widths of its 95 % interval by which a parameter that screening left out must differ from no
-effect, to be fitted in the end."""
+effect, at a timestep of 0, to be fitted in the end."""
 HOPELESS = 8.0
 """What a candidate is expected to leave unexplained, relative to what the best one left when it was
 fitted, above which it is not fitted; the runner-up always is."""
@@ -131,21 +131,13 @@ def complete(problem: Problem, best: Contender, say: Callable[[str], None]) -> C
     However little such a parameter explains, without it the others make up for it.
     """
     for fuller in fit_further(problem, best, say):
-        firm = [
-            j
-            for j in fuller.score.columns
-            if j in best.score.columns or _is_firm(problem, fuller.fit, j)
-        ]
-        if len(firm) == len(fuller.score.columns):
-            return fuller
-        if len(firm) > len(best.score.columns):
-            left_out = [j for j in fuller.score.columns if j not in firm]
-            theta = fuller.fit.theta.copy()
-            theta[left_out] = best.fit.theta[left_out]
-            free = [j for j in fuller.fit.free if j not in left_out]
-            start, sensitivity = fuller.fit.start, fuller.fit.sensitivity
-            fitted = fit(problem, theta, start, free, sensitivity=sensitivity)
-            return Contender(dataclasses.replace(best.score, columns=tuple(firm)), fitted)
+        timeless = count_timestep(problem, fuller.fit)
+        further = [j for j in fuller.score.columns if j not in best.score.columns]
+        nil = [j for j in further if not _is_firm(problem, timeless, j)]
+        if not nil:
+            return dataclasses.replace(fuller, timeless=timeless)
+        if len(nil) < len(further):
+            return _without(problem, fuller, nil)
     return best
 
 
@@ -155,6 +147,16 @@ def _is_firm(problem: Problem, fitted: Fit, column: int) -> bool:
     half = 0.5 * (fitted.high[place] - fitted.low[place])
     off = abs(fitted.theta[column] - problem.simulator.base[column])
     return bool(off > FIRM * half)
+
+
+def _without(problem: Problem, fuller: Contender, columns: Sequence[int]) -> Contender:
+    """Fit a contender again without some parameters."""
+    near, theta = fuller.fit, fuller.fit.theta.copy()
+    theta[list(columns)] = problem.simulator.base[list(columns)]
+    free = [j for j in near.free if j not in columns]
+    fitted = fit(problem, theta, near.start, free, sensitivity=near.sensitivity)
+    kept = tuple(j for j in fuller.score.columns if j not in columns)
+    return Contender(dataclasses.replace(fuller.score, columns=kept), fitted)
 
 
 def with_twins(

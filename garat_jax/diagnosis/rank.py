@@ -24,7 +24,7 @@ from garat_jax.diagnosis.fit import Fit, count_timestep, fit, settle
 from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD, Judged, estimates, judge, leads
 from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Candidate
+from garat_jax.diagnosis.results import Candidate, Named
 from garat_jax.diagnosis.screen import Score, screen
 
 REFINED_ABOVE = 1.1
@@ -61,9 +61,15 @@ class Path(NamedTuple):
         return (self.second or self.contender).fit
 
     @property
-    def effects(self) -> set[int]:
+    def named(self) -> set[Named]:
         """What is added on it."""
-        return {c.score.effect for c in (self.contender, self.second) if c}
+        return {self.candidate.named, *([self.then[0][0].named] if self.second else [])}
+
+    def is_like(self, other: "Path") -> bool:
+        """Say whether the other adds the same, or what recordings cannot tell from it."""
+        added = [self.candidate, *([self.then[0][0]] if self.second else [])]
+        alike = {named for c in added for named in (c.named, *c.indistinguishable_from)}
+        return len(self.named) == len(other.named) and other.named <= alike
 
 
 class Outcome(NamedTuple):
@@ -104,26 +110,23 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
     floor = noise_floor(problem, metric, before)
     adequate = not is_above(problem, metric, before, floor)
     current, steps, first_round, best, added = before, [], (), None, None
-    ahead: tuple[Fit, Judged] | None = None
     for number in range(ROUNDS):
         gap = is_above(problem, metric, current, floor)
         if number and not gap:
             break
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}")
-        if ahead and ahead[0] is current:
-            judged = ahead[1]
-        else:
-            judged = _round(problem, metric, current, held, floor, say)
-        judged, ahead = _look_ahead(problem, metric, judged, held, floor, say)
+        judged = _round(problem, metric, current, held, floor, say)
+        judged, chosen = _look_ahead(problem, metric, judged, held, say)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
-        candidate, contender = judged[0] if judged else (None, None)
+        contender = judged[0][1] if judged else None
         best = contender.fit if contender is not None else best
-        if candidate is None or contender is None or not candidate.passes:
+        if not chosen:
             break
-        added = complete(problem, contender, say)
+        steps += [Step(c, k.score.effect, k.fit) for c, k in chosen]
+        added = _completed(problem, [contender for _, contender in chosen], say)
         current = added.fit
-        steps.append(Step(candidate, contender.score.effect, current))
+        steps[-1] = steps[-1]._replace(fit=current)
         steps, current = _prune(problem, before, steps, current, say)
         floor = noise_floor(problem, metric, current)
     if added is not None:
@@ -149,33 +152,45 @@ def _round(problem: Problem, metric: Metric, current: Fit, held, floor: Floor, s
     return judge(problem, metric, current, scores, contenders, gap)
 
 
-def _look_ahead(problem: Problem, metric: Metric, judged: Judged, held, floor: Floor, say):
+def _look_ahead(problem: Problem, metric: Metric, judged: Judged, held, say):
     """Where only its lead keeps the first candidate back, see what each leads to with one more.
 
     Of two effects that are missing, neither explains so much by itself that no third can rival it.
 
     Returns:
-        The candidates, the first of which passes if with another it leads all rivals with another;
-        and if it does, its fit and the round that starts from there.
+        The candidates, the first of which passes if with another it leads its rivals with another;
+        and what is to be added: the first if it passes, with the other if it needs that.
     """
     if not judged or judged[0][0].why != NO_CERTAIN_LEAD:
-        return judged, None
+        passes = judged and judged[0][0].passes
+        return judged, [(c, k) for c, k in judged[:1] if k and passes]
     first = judged[0][0]
     rivals = [(c, k) for c, k in judged if k and c.named not in first.indistinguishable_from]
     paths = []
     for candidate, contender in rivals[: 1 + RIVALS]:
         say(f"looking for what would be missing beside {candidate.named}")
-        effect = contender.score.effect
-        then = _round(problem, metric, contender.fit, [*held, effect], floor, say)
+        floor = noise_floor(problem, metric, contender.fit)
+        effects = [*held, contender.score.effect]
+        then = _round(problem, metric, contender.fit, effects, floor, say)
         paths.append(Path(candidate, contender, then))
     best = min(paths, key=lambda path: path.fit.cost.sum())
-    others = [path.fit for path in paths if path.effects != best.effects]
-    if best.second is None or not all(leads(problem, best.fit, other) for other in others):
-        return judged, None
+    others = [path.fit for path in paths if not best.is_like(path)]
+    may = best.second and best.candidate.why == NO_CERTAIN_LEAD
+    if not may or not all(leads(problem, best.fit, other) for other in others):
+        return judged, []
     why = f"passes every gate together with {best.then[0][0].named}"
     passed = dataclasses.replace(best.candidate, passes=True, why=why)
     rest = [pair for pair in judged if pair[1] is not best.contender]
-    return [(passed, best.contender), *rest], (best.contender.fit, best.then)
+    chosen = [(passed, best.contender), (best.then[0][0], best.second)]
+    return [(passed, best.contender), *rest], chosen
+
+
+def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:
+    """Return the last contender, with what is left out of the laws of all that were added."""
+    last = added[-1]
+    for contender in added:
+        last = complete(problem, dataclasses.replace(last, score=contender.score), say)
+    return last
 
 
 def _num_tried(problem: Problem, scores: Sequence[Score]) -> int:

@@ -139,7 +139,7 @@ class Effect(abc.ABC):
     senses: ClassVar[bool] = False
     """Whether `sense` does anything: the effect is one of sensors, not of the motion."""
     tunes: ClassVar[bool] = False
-    """Whether `tune` does anything: a native field changes with the state, which is read."""
+    """Whether `tune` does anything; it needs `reads_state`."""
     notes: ClassVar[bool] = False
     """Whether `note` does anything: what is reported depends on states of some time ago."""
     refines: ClassVar[tuple[str, ...]] = ()
@@ -157,6 +157,8 @@ class Effect(abc.ABC):
         other.
         """
         super().__init_subclass__()
+        if cls.tunes and not cls.reads_state:
+            raise TypeError(f"{cls.__name__} tunes the model, so it must declare reads_state")
         if "kind" in cls.__dict__:
             cls.__annotations__["kind"] = str
             cls.kind = struct.field(pytree_node=False, default=cls.kind, kw_only=True)
@@ -297,6 +299,8 @@ class Effect(abc.ABC):
 
     def tune(self, model: ModelView, state: Any, ctrl: jax.Array) -> dict[str, jax.Array]:
         """Return the native model fields that this effect replaces for one physics substep.
+
+        MuJoCo's derived constants, as the inertia that constraints feel, do not follow them.
 
         Args:
             model: The model as all effects leave it, and those before this one in this substep.

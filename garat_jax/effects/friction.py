@@ -116,7 +116,6 @@ class VaryingFriction(Effect):
     """Dry friction whose size follows the motion: a row of that size in each substep."""
 
     elements: ClassVar[tuple[str, ...]] = ("joint",)
-    acts: ClassVar[bool] = True
     reads_state: ClassVar[bool] = True
     tunes: ClassVar[bool] = True
 
@@ -184,6 +183,7 @@ class AsymmetricFriction(VaryingFriction):
     independent: ClassVar[bool] = True
     law: ClassVar[str] = "τ = −(τ₊ + c₊·q̇) for q̇ > 0, τ₋ − c₋·q̇ for q̇ < 0"
     identified_by: ClassVar[str] = "constant-speed runs in both directions, and rests between them"
+    acts: ClassVar[bool] = True
 
     coulomb_positive: jax.Array = parameter(
         0.0, unit="N m", low=0.0, high=50.0, scale=1e-3, source="As coulomb_friction"
