@@ -1,6 +1,7 @@
 """What all tests share: a compilation cache outside the repository, and the measured data."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,9 @@ os.environ.setdefault(
     "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
 )
 compilation_cache.enable()
+# Shells have what they start in the background ignore Ctrl-C, and so would the programs that tests
+# interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

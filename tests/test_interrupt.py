@@ -64,3 +64,22 @@ def test_an_interrupt_never_raises_within_what_c_entered(block):
 def test_errors_that_no_interrupt_made_stay_what_they_are():
     with pytest.raises(RuntimeError, match="no memory"), interruptible():
         raise RuntimeError("no memory")
+
+
+@pytest.mark.parametrize("block", [interruptible, deferred_interrupt])
+def test_an_ignored_interrupt_stays_ignored(block):
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with block():
+            press()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_that_a_callback_held_ends_the_block():
+    @entered_from_c
+    def callback():
+        press()
+
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        callback()
