@@ -105,6 +105,8 @@ class RunDirectory:
     def record_settings(self, settings: Any) -> None:
         """Write down every setting that decides the results, defaults included.
 
+        A limit that is infinite becomes null, because JSON has no infinity.
+
         Args:
             settings: A dataclass or mapping.
 
@@ -112,7 +114,7 @@ class RunDirectory:
             UserError: The run was begun with other settings.
         """
         record = self.read_json(CONFIG)
-        new = to_plain(settings)
+        new = finite_or_null(to_plain(settings))
         _check_same(self.root, record.get("settings", new), new, "settings")
         if "settings" not in record:
             self.write_json(CONFIG, {**record, "settings": new})

@@ -10,6 +10,8 @@ from garat_jax import dynamics, rollout
 from garat_jax.envs.pairs import PAIRS
 from garat_jax.methods.transition_error import transition_error
 from garat_jax.overrides import load_spec
+from garat_jax.presets import METHODS
+from garat_jax.runs import RunDirectory
 from garat_jax.transfer import as_of
 
 # Desai et al. 2020, table of modified environments.
@@ -77,3 +79,11 @@ def test_what_the_target_showed_can_be_replayed_in_the_source(name):
     same, other = jax.jit(errors)(jax.random.key(0))
     assert same < 1e-6
     assert other > 1e-3
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_a_run_writes_down_the_settings_of_every_pair(name, tmp_path):
+    config = METHODS["garat"](PAIRS[name], seeds=1)
+    run = RunDirectory.create(tmp_path / "run", {}, "", [0])
+    run.record_settings(config)
+    RunDirectory.create(tmp_path / "run", {}, "", [0], resume=True).record_settings(config)
