@@ -2,7 +2,8 @@
 
 Dry friction is MuJoCo's constraint row (frictionloss), which holds at rest, takes energy away and
 is stable at any timestep. Where a law depends on the motion, the row has another size in each
-substep.
+substep. With MuJoCo's default softness (solreffriction) a row changes sign some 10 ms before the
+speed does, so where the smaller of two frictions is fitted to a sharp one it may be a tenth off.
 """
 
 import abc

@@ -86,7 +86,9 @@ def test_what_mjcf_can_say_is_the_same_physics(tmp_path, kind):
     model = load_model(write(tmp_path))
     host = model.compile("mujoco").host.model
     cls = CATALOGUE[kind]
-    target = cls.targets(host)[-1]
+    if not (targets := cls.targets(host)):
+        pytest.skip(f"{kind} has no place on this arm")
+    target = targets[-1]
     effect = cls(target=target, **cls.starts(host, target)[-1])
     card = load_model(save_card(tmp_path / "with.toml", model, [effect]))
     exported = export_mjcf(card, tmp_path / "with.xml")

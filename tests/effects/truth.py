@@ -43,11 +43,13 @@ class Truth(NamedTuple):
     Attributes:
         change: Changes the spec.
         force: Torque [N m] on the joint at (angle, speed, command).
+        friction: Size [N m] of the joint's friction loss at a speed.
         command: Command at (time, commands so far as a function of time).
     """
 
     change: Callable[[mujoco.MjSpec], None] = lambda spec: None
     force: Callable[[float, float, float], float] = lambda q, v, u: 0.0
+    friction: Callable[[float], float] = lambda v: 0.0
     command: Callable[[float, Callable[[float], float]], float] = lambda t, u: u(t)
 
 
@@ -69,6 +71,7 @@ def record(mjcf: str, truth: Truth, ctrl: np.ndarray, start=(0.4, 0.0)) -> np.nd
     interval = SUBSTEPS * changed.option.timestep
     changed.option.timestep /= FINER
     model = changed.compile()
+    frictionloss = model.dof_frictionloss[0]
     data = mujoco.MjData(model)
     data.qpos[0], data.qvel[0] = start
     states = []
@@ -81,6 +84,7 @@ def record(mjcf: str, truth: Truth, ctrl: np.ndarray, start=(0.4, 0.0)) -> np.nd
             u = truth.command(data.time, held)
             data.ctrl[0] = u
             data.qfrc_applied[0] = truth.force(data.qpos[0], data.qvel[0], u)
+            model.dof_frictionloss[0] = frictionloss + truth.friction(data.qvel[0])
             mujoco.mj_step(model, data)
         states.append([data.qpos.sum(), data.qvel.sum()])
     return np.asarray(states)
