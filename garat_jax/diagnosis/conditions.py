@@ -12,7 +12,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from garat_jax.diagnosis.diagnose import choose_horizon, diagnose, split, thin
+from garat_jax.diagnosis.diagnose import UNEXPLAINED, choose_horizon, diagnose, split, thin
 from garat_jax.diagnosis.fit import count_timestep, fit
 from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording
@@ -46,7 +46,8 @@ def diagnose_conditions(
         The diagnosis of the base condition, with that of each other one in `conditions`: there the
         model has the shared effects, and a selected one of the same kind and place replaces one.
         The selected effects' parameters are those that fit the recordings of all conditions
-        together, save the unexplained ones; errors and candidates are of each condition by itself.
+        together, save those in which much of the error stays unexplained; errors and candidates are
+        of each condition by itself.
     """
     base = diagnose(model, recordings, holdout, say)
     shared = as_effects(model, base.selected)
@@ -54,14 +55,20 @@ def diagnose_conditions(
     for name, measured in conditions.items():
         say(f"the condition {name}")
         found[name] = diagnose(model, measured, say=say, shared=shared)
-    clear = [name for name, other in found.items() if other.verdict != "unexplained"]
+    clear = [name for name, other in found.items() if _is_clear(other)]
     together = (base, *(found[name] for name in clear))
-    if clear and base.verdict != "unexplained" and any(d.selected for d in together):
+    if clear and _is_clear(base) and any(d.selected for d in together):
         say("fitting all conditions together")
         fitted = [split(recordings, holdout)[0], *(split(conditions[n], ())[0] for n in clear)]
         base, *others = _fit_together(model, fitted, together)
         found |= dict(zip(clear, others, strict=True))
     return dataclasses.replace(base, conditions=found)
+
+
+def _is_clear(found: Diagnosis) -> bool:
+    """Say whether so little of the error stays that it cannot mislead a fit."""
+    little = found.error.unexplained_share <= UNEXPLAINED
+    return found.verdict == "adequate" or (bool(found.selected) and little)
 
 
 class _Place(NamedTuple):

@@ -12,7 +12,7 @@ from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.fit import settle
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, signals
-from garat_jax.diagnosis.metric import make_metric, trusted
+from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Predictor, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
@@ -26,16 +26,21 @@ from garat_jax.provenance import versions
 
 HORIZONS = (2.0, 1.0, 0.5, 0.3, 0.2)
 """Seconds that a segment may last, longest first."""
+PERTURBATIONS = (1e-5, 1e-2)
+"""Changes of the initial states whose growth is measured, relative to their spread. Contacts that
+chatter at the model's timestep make a small one grow much, and a large one often, but not both."""
 LARGEST_GROWTH = 4.0
 """Growth of a small perturbation within a segment; above it sensitivities cease to be linear."""
 LARGEST_ERROR = 0.2
 """Error within a segment, relative to the signal's spread, for the same reason."""
+BEYOND = 4.0
+"""Standard deviations of its noise that the error of a signal may reach by noise alone."""
 MOST = 0.9
 """Share of the segments that must keep below both."""
 ENOUGH = 250.0
 """Samples a second that a passive mechanism needs."""
 UNEXPLAINED = 0.3
-"""Share of the error that may stay before the verdict is `unexplained`."""
+"""Share of the error that may stay, however near to the noise floor that is."""
 
 
 def diagnose(
@@ -148,22 +153,14 @@ def choose_horizon(simulator: Predictor, recordings, grid) -> tuple[float, Segme
     """Choose the longest horizon over which fits are nearly linear, and cut there.
 
     Growth is the change of the signals after a small change of the initial state, both relative to
-    the signals' spread; the error is that of the model from the measured initial state.
+    the signals' spread; the error is that of the model from the measured initial state, less what
+    noise makes of it. Signals that hardly move do not count, unless none moves.
     """
     longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
     horizons = [h for h in HORIZONS if h <= max(longest, HORIZONS[-1])]
     segments = cut(recordings, grid, horizons[0])
-    size = 1e-5
-    unit = size * segments.start_unit
-    starts = segments.start + np.concatenate([np.zeros((1, len(unit))), np.diag(unit)])[:, None]
-    thetas = np.tile(simulator.base, (len(starts), 1))
-    predicted = simulator.predict(thetas, starts, segments)
-    change = (predicted[1:] - predicted[0]) / segments.spread
-    growth = np.abs(change).max(axis=(0, 3)) / size
-    growth = np.where(np.isfinite(growth), growth, np.inf)
     sample = grid.interval * grid.per_sample
-    error = np.abs(predicted[0] - segments.measured) * segments.weight[..., None] / segments.spread
-    error = np.where(np.isfinite(error), error, np.inf).max(axis=2)
+    growth, error = _growth_and_error(simulator, segments)
     limits = np.stack([growth / LARGEST_GROWTH, error / LARGEST_ERROR])
     horizon = horizons[-1]
     for horizon in horizons:
@@ -173,12 +170,33 @@ def choose_horizon(simulator: Predictor, recordings, grid) -> tuple[float, Segme
     return horizon, segments if horizon == horizons[0] else cut(recordings, grid, horizon)
 
 
+def _growth_and_error(simulator: Predictor, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest of any signal that moves, each [S, L]; see `choose_horizon`."""
+    unit = np.diag(segments.start_unit)
+    steps = [np.zeros((1, len(unit))), *(size * unit for size in PERTURBATIONS)]
+    starts = segments.start + np.concatenate(steps)[:, None]
+    thetas = np.tile(simulator.base, (len(starts), 1))
+    predicted = simulator.predict(thetas, starts, segments)
+    moves = segments.spread > QUIET * segments.noise
+    seen = moves if np.any(moves) else np.ones_like(moves)
+    change = np.abs(predicted[1:] - predicted[0])[..., seen] / segments.spread[seen]
+    by_size = zip(np.split(change, len(PERTURBATIONS)), PERTURBATIONS, strict=True)
+    growth = np.min([part.max(axis=(0, 3)) / size for part, size in by_size], axis=0)
+    error = np.maximum(np.abs(predicted[0] - segments.measured) - BEYOND * segments.noise, 0.0)
+    error = (error * segments.weight[..., None] / segments.spread)[..., seen].max(axis=2)
+    return np.nan_to_num(growth, nan=np.inf), np.nan_to_num(error, nan=np.inf)
+
+
 def _verdict(outcome: Outcome, error: Errors) -> Verdict:
     if outcome.adequate:
         return "adequate"
-    if not outcome.selected or error.unexplained_share > UNEXPLAINED:
-        return "unexplained"
-    return "missing_effect"
+    return "missing_effect" if outcome.selected and is_explained(error) else "unexplained"
+
+
+def is_explained(error: Errors) -> bool:
+    """Say whether little of the error is left, and as near its floor as an adequate model's."""
+    near_floor = error.after <= ABOVE_FLOOR * error.noise_floor
+    return near_floor and error.unexplained_share <= UNEXPLAINED
 
 
 def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str) -> Errors:

@@ -99,6 +99,6 @@ def _offsets(problem: Problem) -> np.ndarray:
     """Return a constant error of each position sensor, whitened, [nq, S, N]."""
     segments = problem.segments
     num_position = problem.simulator.host.nq
-    unit = np.eye(segments.measured.shape[2])[:num_position] / segments.noise
-    offset = (segments.weight * segments.trust)[None, :, :, None] * unit[:, None, None, :]
+    unit = np.eye(segments.measured.shape[2])[:num_position]
+    offset = problem.scale * unit[:, None, None, :]
     return offset.reshape(num_position, *segments.weight.shape[:1], -1)

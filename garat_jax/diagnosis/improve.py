@@ -9,7 +9,7 @@ import numpy as np
 
 from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.diagnose import UNEXPLAINED, choose_horizon, diagnose, split, thin
+from garat_jax.diagnosis.diagnose import choose_horizon, diagnose, is_explained, split, thin
 from garat_jax.diagnosis.export import copy_model
 from garat_jax.diagnosis.fit import settle
 from garat_jax.diagnosis.measurements import Recording
@@ -117,9 +117,6 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     before, after = ladder[0].error_holdout, ladder[-1].error_holdout
     rest = float(np.sqrt(max(after**2 - first.error.noise_floor**2, 0.0)))
     share = rest / before if before > 0 else 0.0
-    verdict: Verdict = "missing_effect"
-    if last.verdict == "unexplained" and share > UNEXPLAINED:
-        verdict = "unexplained"
     error = dataclasses.replace(
         first.error,
         before=before,
@@ -127,6 +124,8 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
         unexplained_share=share,
         per_signal=_with_after(first.error, per_signal),
     )
+    stays = last.verdict == "unexplained" and not is_explained(error)
+    verdict: Verdict = "unexplained" if stays else "missing_effect"
     return dataclasses.replace(
         first,
         verdict=verdict,

@@ -106,7 +106,7 @@ class Problem(Generic[AnySimulator]):
     def scale(self) -> np.ndarray:
         """Return what a deviation counts, [S, L, num_signals]."""
         s = self.segments
-        return (s.weight * s.trust)[..., None] / s.noise
+        return s.weight[..., None] * s.trust / s.noise
 
     def integrator_error(
         self, theta: np.ndarray, start: np.ndarray, residual: np.ndarray

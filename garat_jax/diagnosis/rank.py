@@ -35,11 +35,19 @@ ROUNDS = 5
 
 
 class Step(NamedTuple):
-    """One effect that was added, and the fit with it."""
+    """One effect that was added.
+
+    Attributes:
+        candidate: What was said of it.
+        effect: Its index among the simulator's.
+        fit: The fit with it.
+        alike: What the recordings could not tell from it when it was added.
+    """
 
     candidate: Candidate
     effect: int
     fit: Fit
+    alike: tuple[tuple[Candidate, Contender], ...] = ()
 
 
 class Path(NamedTuple):
@@ -123,11 +131,12 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         best = contender.fit if contender is not None else best
         if not chosen:
             break
-        steps += [Step(c, k.score.effect, k.fit) for c, k in chosen]
+        steps += [_step(candidate, contender, judged) for candidate, contender in chosen]
         added = _completed(problem, [contender for _, contender in chosen], say)
         current = added.fit
         steps[-1] = steps[-1]._replace(fit=current)
         steps, current = _prune(problem, before, steps, current, say)
+        steps, current = swap(problem, steps, current, say)
         floor = noise_floor(problem, metric, current)
     if added is not None:
         known = added.timeless if current is added.fit else None
@@ -233,6 +242,50 @@ def _prune(problem: Problem, before: Fit, steps: list[Step], current: Fit, say):
         return steps, current
     again = [_fit_only(problem, current, [s.effect for s in kept[:n]]) for n in range(1, len(kept))]
     return [s._replace(fit=f) for s, f in zip(kept, (*again, current), strict=True)], current
+
+
+def _step(candidate: Candidate, contender: Contender, judged: Judged) -> Step:
+    """Return the step of a candidate that is added, with those like it among all that were."""
+    named = candidate.indistinguishable_from
+    alike = tuple((c, k) for c, k in judged if k and c.named in named)
+    return Step(candidate, contender.score.effect, contender.fit, alike)
+
+
+def swap(problem: Problem, steps: list[Step], current: Fit, say):
+    """Put effects in the place of those that they were like, where they fit better by now.
+
+    What recordings cannot tell from an effect by itself they may tell beside another.
+    """
+    for step in steps[:-1]:
+        others = [s.effect for s in steps if s.effect != step.effect]
+        for candidate, contender in step.alike:
+            say(f"trying {candidate.named} instead of {step.candidate.named}")
+            trial = _fit_instead(problem, current, others, contender)
+            if leads(problem, trial, current):
+                better = _instead_of(step.candidate, candidate)
+                swapped = Step(better, contender.score.effect, contender.fit)
+                steps = [swapped if s.effect == step.effect else s for s in steps]
+                steps[-1], current = steps[-1]._replace(fit=trial), trial
+                break
+    return steps, current
+
+
+def _instead_of(old: Candidate, new: Candidate) -> Candidate:
+    """Return a candidate that passes because another, which it was like, fits worse by now."""
+    alike = tuple(named for named in new.indistinguishable_from if named != old.named)
+    why = f"fits better than {old.named} beside what was found since"
+    return dataclasses.replace(new, indistinguishable_from=alike, passes=True, why=why)
+
+
+def _fit_instead(problem: Problem, current: Fit, others: Sequence[int], instead: Contender) -> Fit:
+    """Fit again with the effects `others` and with what was fitted `instead` of the rest."""
+    columns = list(instead.score.columns)
+    present = np.asarray([slot.effect in others for slot in problem.simulator.slots])
+    theta = np.where(present, current.theta, problem.simulator.base)
+    theta[columns] = instead.fit.theta[columns]
+    free = [*(j for j in current.free if present[j]), *columns]
+    rival = current.cost[problem.fitted].sum()
+    return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
 
 
 def _fit_only(problem: Problem, current: Fit, effects: Sequence[int], rival=np.inf) -> Fit:

@@ -153,11 +153,9 @@ class _FrictionAlongPath(Effect):
 
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Add the steady part to what the law itself replaces."""
-        model = model.replace(self.varying.fields(model))
-        return {
-            **self.varying.fields(model),
-            **_more_friction(model, self.name, self.varying.steady()),
-        }
+        native = self.varying.fields(model)
+        model = model.replace(native)
+        return native | _more_friction(model, self.name, self.varying.steady())
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
         """Add the rest against the motion to what the law itself does."""

@@ -1,0 +1,77 @@
+"""What was added gives way to what fits better beside the effects found since."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.contend import Contender
+from garat_jax.diagnosis.diagnose import choose_horizon
+from garat_jax.diagnosis.fit import fit, settle
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.rank import Step, swap
+from garat_jax.diagnosis.results import Candidate, Interval, Named
+from garat_jax.diagnosis.screen import Score
+from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.effects import QuadraticDrag, TorqueOffset, ViscousDamping
+from tests.diagnosis.pendulum import MODEL, add_damping, record
+
+AT = "joint/hinge"
+EFFECTS = (QuadraticDrag(AT), ViscousDamping(AT), TorqueOffset(AT))
+DRAG, DAMPING, OFFSET = range(3)
+DAMPED = 0.05  # N m s/rad
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem[Simulator]:
+    damped = functools.partial(add_damping, size=DAMPED)
+    recordings = [record(damped, seed, pull=0.1) for seed in range(2)]
+    grid = choose_grid(recordings, 0.002)
+    coarse, finer = (Simulator(MODEL, EFFECTS, grid, refine) for refine in (1, 2))
+    _, segments = choose_horizon(coarse, recordings, grid)
+    return Problem(coarse, finer, segments, np.ones(len(segments.start), bool), 0.004)
+
+
+def fit_with(problem: Problem, *effects: int):
+    before = settle(problem, problem.simulator.base, problem.segments.start)
+    return fit(problem, problem.simulator.base, before.start, effects)
+
+
+def candidate(effect: int, *alike: int) -> Candidate:
+    nan = float("nan")
+    named = tuple(Named(EFFECTS[i].kind, AT) for i in alike)
+    gain = Interval(nan, nan, nan)
+    return Candidate(EFFECTS[effect].kind, AT, {}, 0.5, 0.0, nan, gain, 1.0, named, True, "")
+
+
+def swapped(problem: Problem, first: int, other: int):
+    """Add an effect that was like another, then an offset; return what becomes of them."""
+    score = Score(other, (other,), (0.0,), {}, 0.5, 0.0, True, np.zeros(0))
+    rival = Contender(score, fit_with(problem, other))
+    alike = ((candidate(other, first), rival),)
+    both = fit_with(problem, first, OFFSET)
+    steps = [
+        Step(candidate(first, other), first, fit_with(problem, first), alike),
+        Step(candidate(OFFSET), OFFSET, both),
+    ]
+    return *swap(problem, steps, both, lambda line: None), both
+
+
+def test_an_effect_gives_way_to_one_that_it_was_like_and_that_fits_better_by_now(problem):
+    steps, current, before = swapped(problem, DRAG, DAMPING)
+    assert [step.effect for step in steps] == [DAMPING, OFFSET]
+    assert steps[0].candidate.named == Named("viscous_damping", AT)
+    assert steps[0].candidate.passes
+    assert steps[0].candidate.indistinguishable_from == ()
+    assert current.cost.sum() < 0.9 * before.cost.sum()
+    assert current.theta[DAMPING] == pytest.approx(DAMPED, rel=0.05)
+    assert current.theta[DRAG] == 0.0
+    assert steps[-1].fit is current
+
+
+def test_the_true_effect_stays(problem):
+    steps, current, before = swapped(problem, DAMPING, DRAG)
+    assert [step.effect for step in steps] == [DAMPING, OFFSET]
+    assert steps[0].candidate.indistinguishable_from == (Named("quadratic_drag", AT),)
+    assert current is before
