@@ -46,6 +46,8 @@ SEARCHED = 12
 """Segments with which a search is made at least, evenly chosen; each of its steps settles them."""
 SEARCHED_WITHIN = 4.0
 """Cost, relative to another fit's, above which a fit is not worth a search."""
+SEARCHED_ABOVE = 1.1
+"""Cost, relative to that of noise, up to which a search has nothing to find."""
 SEARCH_STEPS = 10
 """Largest number of rounds of a search."""
 SEARCH_ON = 0.99
@@ -198,13 +200,15 @@ def _follow(problem: Problem, theta, near: Fit) -> Fit:
 
 
 def _fit_across_contacts(problem: Problem, theta, start, free):
-    """Search, then take one Gauss-Newton step with `_wide` differences, each if it is better.
+    """Search if more is left than noise, and take a Gauss-Newton step with `_wide` differences.
 
     Returns:
-        What was reached, the linearisation there, and which parameters are excited.
+        The best that was reached, the linearisation there, and which parameters are excited.
     """
-    found = _search(problem, theta, start, free)
-    near = min((settle(problem, at, start) for at in (theta, found)), key=partial(_cost, problem))
+    near = settle(problem, theta, start)
+    if _cost(problem, near) > SEARCHED_ABOVE * problem.expected[problem.fitted].sum():
+        found = settle(problem, _search(problem, theta, start, free), start)
+        near = min((near, found), key=partial(_cost, problem))
     near, lin = _wide(problem, near.theta, near.start, free)
     change, keep = _parameter_step(problem, near.theta, lin, free, 1e-4)
     theta = near.theta.copy()

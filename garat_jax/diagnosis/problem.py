@@ -108,6 +108,11 @@ class Problem(Generic[AnySimulator]):
         s = self.segments
         return s.weight[..., None] * s.trust / s.noise
 
+    @property
+    def expected(self) -> np.ndarray:
+        """Return the cost of each segment that noise alone makes, [S]."""
+        return np.sum((self.scale * self.segments.noise) ** 2, axis=(1, 2))
+
     def integrator_error(
         self, theta: np.ndarray, start: np.ndarray, residual: np.ndarray
     ) -> np.ndarray:

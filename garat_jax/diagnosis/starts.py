@@ -27,8 +27,7 @@ def settle_anew(problem: Problem, theta, start: np.ndarray, lin: Linearisation):
     Noise may lift a foot off the ground or push it in, and another model's initial states may make
     it hop, from where no small step leads back. What is reached anew counts where it is better.
     """
-    expected = np.sum((problem.scale * problem.segments.noise) ** 2, axis=(1, 2))
-    poor = np.flatnonzero(np.sum(lin.residual**2, axis=1) > POOR * expected)
+    poor = np.flatnonzero(np.sum(lin.residual**2, axis=1) > POOR * problem.expected)
     if not len(poor):
         return start, lin
     carried = _carried(problem, start, lin.residual)
