@@ -56,7 +56,7 @@ def fit_contenders(
     likely = [s for s in scores if not s.excluded and s.possible and s.share > 0.02]
     likely = [s for s in likely if s.share > 0.25 * likely[0].share]
     likely = [s for s in likely if not simpler_law(problem, s, likely)]
-    likely = [s for i, s in enumerate(likely) if not _twins(problem, s, likely[:i])]
+    likely = [s for i, s in enumerate(likely) if not twins(problem, s, likely[:i])]
     if not likely:
         return []
     chosen = likely[:CONTENDERS]
@@ -176,15 +176,15 @@ def with_twins(
     others = [s for s in scores if not s.excluded and s.effect not in fitted]
     found = []
     for contender in contenders:
-        for score in _twins(problem, screened[contender.score.effect], others):
+        for score in twins(problem, screened[contender.score.effect], others):
             renamed = _renamed(problem, current, contender, score)
             rival = contender.fit.cost[problem.fitted].sum()
             found.append(renamed or _fit(problem, current, score, rival, say))
     return [*contenders, *found]
 
 
-def _twins(problem: Problem, score: Score, others: Sequence[Score]) -> list[Score]:
-    """Return the candidates of the same kind that change the very same where they were screened."""
+def twins(problem: Problem, score: Score, others: Sequence[Score]) -> list[Score]:
+    """Return those of the others that are of its kind and change the very same where screened."""
     simulator = problem.simulator
 
     def what(score: Score) -> list[str]:

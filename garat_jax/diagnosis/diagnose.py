@@ -10,6 +10,7 @@ import numpy as np
 
 from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.fit import settle
+from garat_jax.diagnosis.judge import SMALLEST_SHARE
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, signals
 from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, trusted
@@ -27,8 +28,9 @@ from garat_jax.provenance import versions
 HORIZONS = (2.0, 1.0, 0.5, 0.3, 0.2)
 """Seconds that a segment may last, longest first."""
 PERTURBATIONS = (1e-5, 1e-2)
-"""Changes of the initial states whose growth is measured, relative to their spread. Contacts that
-chatter at the model's timestep make a small one grow much, and a large one often, but not both."""
+"""Changes of the initial states whose growth is measured, relative to their spread; the smaller one
+counts. Where contacts chatter at the model's timestep, a small change may grow much by an accident
+that a large one has at every start, but then not by so much of its own size."""
 LARGEST_GROWTH = 4.0
 """Growth of a small perturbation within a segment; above it sensitivities cease to be linear."""
 LARGEST_ERROR = 0.2
@@ -154,7 +156,7 @@ def choose_horizon(simulator: Predictor, recordings, grid) -> tuple[float, Segme
 
     Growth is the change of the signals after a small change of the initial state, both relative to
     the signals' spread; the error is that of the model from the measured initial state, less what
-    noise makes of it. Signals that hardly move do not count, unless none moves.
+    noise makes of it, in signals whose spread is `QUIET` times their noise, if there are any.
     """
     longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
     horizons = [h for h in HORIZONS if h <= max(longest, HORIZONS[-1])]
@@ -171,7 +173,7 @@ def choose_horizon(simulator: Predictor, recordings, grid) -> tuple[float, Segme
 
 
 def _growth_and_error(simulator: Predictor, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest of any signal that moves, each [S, L]; see `choose_horizon`."""
+    """Return the largest of any signal, each [S, L]; see `choose_horizon`."""
     unit = np.diag(segments.start_unit)
     steps = [np.zeros((1, len(unit))), *(size * unit for size in PERTURBATIONS)]
     starts = segments.start + np.concatenate(steps)[:, None]
@@ -179,12 +181,16 @@ def _growth_and_error(simulator: Predictor, segments: Segments) -> tuple[np.ndar
     predicted = simulator.predict(thetas, starts, segments)
     moves = segments.spread > QUIET * segments.noise
     seen = moves if np.any(moves) else np.ones_like(moves)
-    change = np.abs(predicted[1:] - predicted[0])[..., seen] / segments.spread[seen]
+    change = np.abs(predicted[1:] - predicted[0]) / segments.spread
     by_size = zip(np.split(change, len(PERTURBATIONS)), PERTURBATIONS, strict=True)
-    growth = np.min([part.max(axis=(0, 3)) / size for part, size in by_size], axis=0)
+    growth = np.min([_or_inf(part.max(axis=(0, 3)) / size) for part, size in by_size], axis=0)
     error = np.maximum(np.abs(predicted[0] - segments.measured) - BEYOND * segments.noise, 0.0)
     error = (error * segments.weight[..., None] / segments.spread)[..., seen].max(axis=2)
-    return np.nan_to_num(growth, nan=np.inf), np.nan_to_num(error, nan=np.inf)
+    return growth, _or_inf(error)
+
+
+def _or_inf(sizes: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(sizes), sizes, np.inf)
 
 
 def _verdict(outcome: Outcome, error: Errors) -> Verdict:
@@ -194,9 +200,10 @@ def _verdict(outcome: Outcome, error: Errors) -> Verdict:
 
 
 def is_explained(error: Errors) -> bool:
-    """Say whether little of the error is left, and as near its floor as an adequate model's."""
+    """Say whether what is left is hardly any of the error, or little and near the noise floor."""
     near_floor = error.after <= ABOVE_FLOOR * error.noise_floor
-    return near_floor and error.unexplained_share <= UNEXPLAINED
+    share = error.unexplained_share
+    return share <= SMALLEST_SHARE or (near_floor and share <= UNEXPLAINED)
 
 
 def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str) -> Errors:

@@ -117,7 +117,7 @@ def fit(
 
     Parameters see the fitted segments only. The initial states of those held out follow as long as
     that lowers their own cost, and are settled at the end. Where contacts make derivatives erratic,
-    a search goes on from what Gauss-Newton steps have reached.
+    and more is left than noise, a search goes on from what Gauss-Newton steps have reached.
 
     Args:
         problem: What is fitted.

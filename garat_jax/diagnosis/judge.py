@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender
+from garat_jax.diagnosis.contend import Contender, twins
 from garat_jax.diagnosis.fit import Fit, count_timestep
 from garat_jax.diagnosis.metric import Metric
 from garat_jax.diagnosis.problem import Problem, block_labels
@@ -46,10 +46,10 @@ def judge(
             judged = _with_timestep(problem, metric, judged)
     fitted = [c.score.effect for c in contenders]
     near = "the model's error is near the noise floor" if not gap else "others explain more"
-    for score in scores:
-        if score.effect not in fitted:
-            sign = "its sign is physically impossible" if not score.possible else near
-            judged.append((_unfitted(problem, score, score.excluded or sign), None))
+    rest = [score for score in scores if score.effect not in fitted]
+    for score in rest:
+        sign = "its sign is physically impossible" if not score.possible else near
+        judged.append((_unfitted(problem, score, rest, score.excluded or sign), None))
     return judged
 
 
@@ -160,9 +160,11 @@ def estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate]
     return estimates
 
 
-def _unfitted(problem: Problem, score: Score, why: str) -> Candidate:
+def _unfitted(problem: Problem, score: Score, others: Sequence[Score], why: str) -> Candidate:
     simulator, nan = problem.simulator, float("nan")
     effect = simulator.effects[score.effect]
+    alike = twins(problem, score, [o for o in others if o is not score and not o.excluded])
+    named = [simulator.effects[other.effect] for other in alike]
     parameters = {}
     for j, size in zip(score.columns, score.size, strict=False):
         p = simulator.slots[j].parameter
@@ -176,7 +178,7 @@ def _unfitted(problem: Problem, score: Score, why: str) -> Candidate:
         error_after=nan,
         held_out_gain=Interval(nan, nan, nan),
         stability=0.0,
-        indistinguishable_from=(),
+        indistinguishable_from=tuple(Named(e.kind, e.target) for e in named),
         passes=False,
         why=why,
     )

@@ -58,16 +58,16 @@ def make_metric(problem: Problem) -> Metric:
     spread = np.maximum(s.measured[held_out].std(axis=0), QUIET * s.noise)
     weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
     num_signals = s.measured.shape[2]
-    counted = np.repeat(s.weight > 0, num_signals, axis=1)
-    return Metric(weight, counted, s.trust.reshape(counted.shape), spread)
+    counted, trust = (np.repeat(x, num_signals, axis=1) for x in (s.weight > 0, s.trust))
+    return Metric(weight, counted, trust, spread)
 
 
 def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
-    """Let count less what the model's timestep does not let it predict.
+    """Let samples count less that the model's timestep does not let it predict.
 
-    Where half a timestep changes a signal's prediction by many standard deviations of noise, as
-    after an impact or in the height of what slides, a residual says nothing of the model's physics.
-    Such changes last to the end of a segment. What other initial states would undo does not count.
+    Where half a timestep changes a prediction by many standard deviations of noise, as after an
+    impact, a residual says nothing of the model's physics. Such changes last to the end of a
+    segment. What other initial states would undo does not count.
 
     Args:
         problem: What is fitted.
@@ -75,7 +75,7 @@ def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
     """
     segments = problem.segments
     shape = segments.measured.shape
-    squares = [x.reshape(shape) ** 2 for x in timestep_error(problem, settled)]
+    squares = [np.mean(x.reshape(shape) ** 2, axis=2) for x in timestep_error(problem, settled)]
     size = np.sqrt(np.maximum.accumulate(np.minimum(*squares), axis=1))
     trust = 1.0 / np.maximum(1.0, size / TRUSTED)
     return dataclasses.replace(problem, segments=dataclasses.replace(segments, trust=trust))

@@ -39,15 +39,20 @@ class Step(NamedTuple):
 
     Attributes:
         candidate: What was said of it.
-        effect: Its index among the simulator's.
-        fit: The fit with it.
-        alike: What the recordings could not tell from it when it was added.
+        contender: How it was fitted then.
+        fit: The fit with it and those before it.
+        alike: What the recordings could not tell from it then.
     """
 
     candidate: Candidate
-    effect: int
+    contender: Contender
     fit: Fit
-    alike: tuple[tuple[Candidate, Contender], ...] = ()
+    alike: Sequence[tuple[Candidate, Contender]]
+
+    @property
+    def effect(self) -> int:
+        """Its index among the simulator's."""
+        return self.contender.score.effect
 
 
 class Path(NamedTuple):
@@ -131,13 +136,15 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         best = contender.fit if contender is not None else best
         if not chosen:
             break
-        steps += [_step(candidate, contender, judged) for candidate, contender in chosen]
-        added = _completed(problem, [contender for _, contender in chosen], say)
+        steps += chosen
+        added = _completed(problem, [step.contender for step in chosen], say)
         current = added.fit
         steps[-1] = steps[-1]._replace(fit=current)
-        steps, current = _prune(problem, before, steps, current, say)
-        steps, current = swap(problem, steps, current, say)
+        steps, current = _prune(problem, steps, current, steps[:-1], say)
         floor = noise_floor(problem, metric, current)
+        if is_above(problem, metric, current, floor, REFINED_ABOVE):
+            steps, current = swap(problem, steps, current, say)
+            floor = noise_floor(problem, metric, current)
     if added is not None:
         known = added.timeless if current is added.fit else None
         current = known or count_timestep(problem, current)
@@ -171,8 +178,7 @@ def _look_ahead(problem: Problem, metric: Metric, judged: Judged, held, say):
         and what is to be added: the first if it passes, with the other if it needs that.
     """
     if not judged or judged[0][0].why != NO_CERTAIN_LEAD:
-        passes = judged and judged[0][0].passes
-        return judged, [(c, k) for c, k in judged[:1] if k and passes]
+        return judged, _first_step(judged)
     first = judged[0][0]
     rivals = [(c, k) for c, k in judged if k and c.named not in first.indistinguishable_from]
     paths = []
@@ -190,8 +196,19 @@ def _look_ahead(problem: Problem, metric: Metric, judged: Judged, held, say):
     why = f"passes every gate together with {best.then[0][0].named}"
     passed = dataclasses.replace(best.candidate, passes=True, why=why)
     rest = [pair for pair in judged if pair[1] is not best.contender]
-    chosen = [(passed, best.contender), (best.then[0][0], best.second)]
-    return [(passed, best.contender), *rest], chosen
+    judged = [(passed, best.contender), *rest]
+    return judged, [*_first_step(judged), *_first_step(best.then)]
+
+
+def _first_step(judged: Judged) -> list[Step]:
+    """Return a round's first candidate as a step, if it passes."""
+    steps = []
+    for first, contender in judged[:1]:
+        if first.passes and contender:
+            others = [(c, k) for c, k in judged[1:] if k]
+            alike = [pair for pair in others if pair[0].named in first.indistinguishable_from]
+            steps.append(Step(first, contender, contender.fit, alike))
+    return steps
 
 
 def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:
@@ -228,46 +245,63 @@ def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Fl
     return contenders
 
 
-def _prune(problem: Problem, before: Fit, steps: list[Step], current: Fit, say):
-    """Drop effects that a later one made superfluous: without them the cost stays as it is."""
+def _prune(problem: Problem, steps: list[Step], current: Fit, tried: list[Step], say):
+    """Drop those effects that became superfluous: without them the cost stays as it is."""
     kept = steps
-    for step in steps[:-1]:
+    for step in tried:
         say(f"trying without {step.candidate.named}")
         others = [s.effect for s in kept if s.effect != step.effect]
         without = _fit_only(problem, current, others, current.cost[problem.fitted].sum())
         if not leads(problem, current, without):
             kept = [other for other in kept if other.effect != step.effect]
             current = without
-    if len(kept) == len(steps):
-        return steps, current
-    again = [_fit_only(problem, current, [s.effect for s in kept[:n]]) for n in range(1, len(kept))]
-    return [s._replace(fit=f) for s, f in zip(kept, (*again, current), strict=True)], current
+    return (steps if len(kept) == len(steps) else _refitted(problem, kept, current)), current
 
 
-def _step(candidate: Candidate, contender: Contender, judged: Judged) -> Step:
-    """Return the step of a candidate that is added, with those like it among all that were."""
-    named = candidate.indistinguishable_from
-    alike = tuple((c, k) for c, k in judged if k and c.named in named)
-    return Step(candidate, contender.score.effect, contender.fit, alike)
+def _refitted(problem: Problem, steps: list[Step], current: Fit) -> list[Step]:
+    """Return steps with the fits that now lead to the current one."""
+    effects = [step.effect for step in steps]
+    fits = [_fit_only(problem, current, effects[:n]) for n in range(1, len(steps))]
+    return [step._replace(fit=f) for step, f in zip(steps, (*fits, current), strict=True)]
 
 
 def swap(problem: Problem, steps: list[Step], current: Fit, say):
     """Put effects in the place of those that they were like, where they fit better by now.
 
-    What recordings cannot tell from an effect by itself they may tell beside another.
+    What recordings cannot tell from an effect by itself they may tell beside another, and what was
+    added since may only have made up for the wrong one.
+
+    Returns:
+        The steps and the fit with all of them.
     """
-    for step in steps[:-1]:
-        others = [s.effect for s in steps if s.effect != step.effect]
+    found, fitted = steps, current
+    for place, step in enumerate(steps[:-1]):
+        others = [s.effect for s in found if s.effect != step.effect]
+        better: list[tuple[Candidate, Contender]] = []
         for candidate, contender in step.alike:
+            if contender.score.effect in others:
+                continue
             say(f"trying {candidate.named} instead of {step.candidate.named}")
-            trial = _fit_instead(problem, current, others, contender)
-            if leads(problem, trial, current):
-                better = _instead_of(step.candidate, candidate)
-                swapped = Step(better, contender.score.effect, contender.fit)
-                steps = [swapped if s.effect == step.effect else s for s in steps]
-                steps[-1], current = steps[-1]._replace(fit=trial), trial
-                break
-    return steps, current
+            trial = _fit_instead(problem, fitted, others, contender)
+            if _is_better(problem, trial, fitted):
+                better.append((candidate, dataclasses.replace(contender, fit=trial)))
+        if better:
+            candidate, contender = min(better, key=lambda pair: pair[1].fit.cost.sum())
+            contender = complete(problem, contender, say)
+            rest = [pair for pair in step.alike if pair[0] is not candidate]
+            alike = [(step.candidate, step.contender), *rest]
+            instead = Step(_instead_of(step.candidate, candidate), contender, contender.fit, alike)
+            found, fitted = [*found[:place], instead, *found[place + 1 :]], contender.fit
+    if fitted is current:
+        return steps, current
+    kept, fitted = _prune(problem, found, fitted, found, say)
+    return (_refitted(problem, kept, fitted) if len(kept) == len(found) else kept), fitted
+
+
+def _is_better(problem: Problem, new: Fit, old: Fit) -> bool:
+    """Say whether a fit is certainly better than another, and no worse on what is held out."""
+    held_out = ~problem.fitted
+    return leads(problem, new, old) and new.cost[held_out].sum() <= old.cost[held_out].sum()
 
 
 def _instead_of(old: Candidate, new: Candidate) -> Candidate:
@@ -303,6 +337,8 @@ def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
     alike = {other for c in selected for other in c.indistinguishable_from}
     corrected = []
     for candidate in candidates:
+        if candidate.named in kept and not candidate.passes:
+            candidate = selected[kept[candidate.named]]
         if candidate.passes and candidate.named not in {*kept, *alike}:
             why = f"superfluous with {' and '.join(map(str, kept))}"
             candidate = dataclasses.replace(candidate, passes=False, why=why)

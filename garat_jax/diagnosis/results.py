@@ -206,8 +206,8 @@ class Diagnosis:
 
     `conditions` holds the diagnoses of recordings made under other conditions, in which the model
     has the effects that were selected here; one of the same kind and place replaces it there. The
-    parameters of `selected` then fit all conditions together, save those that stay unexplained;
-    errors and candidates are of each condition by itself.
+    parameters of `selected` then fit all conditions together, save those in which most of the gap
+    stays; errors and candidates are of each condition by itself.
     """
 
     model: str
@@ -256,17 +256,18 @@ class Diagnosis:
         """What is wrong, in one sentence."""
         error = self.error
         fall = f"held-out error {error.before:.3g} → {error.after:.3g}"
+        floor = f"{error.noise_floor:.3g}"
         if self.verdict == "adequate":
             return (
                 f"The model is adequate: its held-out error {error.before:.3g} is near the noise "
-                f"floor {error.noise_floor:.3g}."
+                f"floor {floor}."
             )
         names = " and ".join(str(c.named) for c in self.selected)
         if self.verdict == "missing_effect":
-            return f"Missing: {names} ({fall}, noise floor {error.noise_floor:.3g})."
+            return f"Missing: {names} ({fall}, noise floor {floor})."
         share = f"{100 * error.unexplained_share:.0f} % of the error"
         if names:
-            return f"Found {names} ({fall}), but {share} stays unexplained."
+            return f"Found {names} ({fall}, noise floor {floor}), but {share} stays unexplained."
         return f"Nothing in the catalogue explains the error: {share} stays unexplained."
 
     def __str__(self) -> str:

@@ -71,8 +71,13 @@ def test_an_effect_outside_the_catalogue_is_unexplained_and_the_result_is_plain(
 
 @pytest.mark.parametrize(
     ("after", "floor", "share", "explained"),
-    [(0.1, 0.08, 0.06, True), (0.1, 0.06, 0.08, False), (0.5, 0.35, 0.36, False)],
-    ids=["near the floor", "above the floor", "much is left"],
+    [
+        (0.1, 0.08, 0.06, True),
+        (0.1, 0.06, 0.08, False),
+        (0.5, 0.35, 0.36, False),
+        (0.04, 0.02, 0.035, True),
+    ],
+    ids=["near the floor", "above the floor", "much is left", "hardly any is left"],
 )
 def test_a_gap_is_explained_if_little_is_left_and_that_near_the_floor(
     after, floor, share, explained
@@ -116,8 +121,14 @@ def test_a_height_that_hardly_moves_does_not_shorten_segments():
     horizon, segments = choose_horizon(simulator, [recording], grid)
     assert horizon >= 1.0
     assert segments.measured.shape[1] == round(horizon / 0.004)
-    quaking = dataclasses.replace(recording, qpos=noisy[:, :2] + 0.1 * np.sin(40 * time)[:, None])
-    assert choose_horizon(simulator, [quaking], grid)[0] == 0.2
+    hopping = 0.05 * np.abs(np.sin(3.0 * time))
+    heights = np.stack([hopping, np.gradient(hopping, time)], axis=1)
+    lifted = dataclasses.replace(
+        recording,
+        qpos=noisy[:, :2] + [0, 1] * heights[:, :1],
+        qvel=noisy[:, 2:] + [0, 1] * heights[:, 1:],
+    )
+    assert choose_horizon(simulator, [lifted], grid)[0] == 0.2
 
 
 @pytest.mark.slow

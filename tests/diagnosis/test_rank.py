@@ -14,12 +14,12 @@ from garat_jax.diagnosis.results import Candidate, Interval, Named
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
-from garat_jax.effects import QuadraticDrag, TorqueOffset, ViscousDamping
+from garat_jax.effects import MotorGain, QuadraticDrag, TorqueOffset, ViscousDamping
 from tests.diagnosis.pendulum import MODEL, add_damping, record
 
 AT = "joint/hinge"
-EFFECTS = (QuadraticDrag(AT), ViscousDamping(AT), TorqueOffset(AT))
-DRAG, DAMPING, OFFSET = range(3)
+EFFECTS = (QuadraticDrag(AT), ViscousDamping(AT), TorqueOffset(AT), MotorGain("actuator/motor"))
+DRAG, DAMPING, OFFSET, GAIN = range(4)
 DAMPED = 0.05  # N m s/rad
 
 
@@ -45,21 +45,25 @@ def candidate(effect: int, *alike: int) -> Candidate:
     return Candidate(EFFECTS[effect].kind, AT, {}, 0.5, 0.0, nan, gain, 1.0, named, True, "")
 
 
-def swapped(problem: Problem, first: int, other: int):
-    """Add an effect that was like another, then an offset; return what becomes of them."""
-    score = Score(other, (other,), (0.0,), {}, 0.5, 0.0, True, np.zeros(0))
-    rival = Contender(score, fit_with(problem, other))
-    alike = ((candidate(other, first), rival),)
-    both = fit_with(problem, first, OFFSET)
-    steps = [
-        Step(candidate(first, other), first, fit_with(problem, first), alike),
-        Step(candidate(OFFSET), OFFSET, both),
-    ]
-    return *swap(problem, steps, both, lambda line: None), both
+def contender(problem: Problem, effect: int) -> Contender:
+    score = Score(effect, (effect,), (0.0,), {}, 0.5, 0.0, True, np.zeros(0))
+    return Contender(score, fit_with(problem, effect))
+
+
+def swapped(problem: Problem, first: int, other: int, *later: int):
+    """Add an effect that was like another, then more; return what becomes of them."""
+    alike = [(candidate(other, first), contender(problem, other))]
+    own = contender(problem, first)
+    steps, added = [Step(candidate(first, other), own, own.fit, alike)], [first]
+    for effect in later:
+        added.append(effect)
+        fitted = fit_with(problem, *added)
+        steps.append(Step(candidate(effect), contender(problem, effect), fitted, []))
+    return *swap(problem, steps, steps[-1].fit, lambda line: None), steps[-1].fit
 
 
 def test_an_effect_gives_way_to_one_that_it_was_like_and_that_fits_better_by_now(problem):
-    steps, current, before = swapped(problem, DRAG, DAMPING)
+    steps, current, before = swapped(problem, DRAG, DAMPING, OFFSET)
     assert [step.effect for step in steps] == [DAMPING, OFFSET]
     assert steps[0].candidate.named == Named("viscous_damping", AT)
     assert steps[0].candidate.passes
@@ -70,8 +74,16 @@ def test_an_effect_gives_way_to_one_that_it_was_like_and_that_fits_better_by_now
     assert steps[-1].fit is current
 
 
+def test_what_only_made_up_for_the_wrong_effect_goes_with_it(problem):
+    steps, current, before = swapped(problem, DRAG, DAMPING, OFFSET, GAIN)
+    assert [step.effect for step in steps] == [DAMPING, OFFSET]
+    assert current.cost.sum() < 0.9 * before.cost.sum()
+    assert current.theta[GAIN] == 1.0
+    assert [float(step.fit.theta[DRAG]) for step in steps] == [0.0, 0.0]
+
+
 def test_the_true_effect_stays(problem):
-    steps, current, before = swapped(problem, DAMPING, DRAG)
+    steps, current, before = swapped(problem, DAMPING, DRAG, OFFSET)
     assert [step.effect for step in steps] == [DAMPING, OFFSET]
     assert steps[0].candidate.indistinguishable_from == (Named("quadratic_drag", AT),)
     assert current is before
