@@ -187,27 +187,35 @@ def ground() -> str:
 
 
 def fidelity() -> str:
-    """Three rows a world: MuJoCo's defaults, the fastest faithful settings, and one iteration."""
+    """MuJoCo's defaults, the fastest settings faithful in both engines, and one iteration."""
     paths = sorted((ROOT / "benchmarks/results").glob("fidelity_*.json"))
     if not paths:
         return "Not measured yet: `python benchmarks/fidelity.py`.\n"
     results = [read(path.stem) for path in paths]
     lines = []
     for result in results:
-        rows = [row for row in result["rows"] if row["engine"] == "mjx"]
-        best = max(
-            (row for row in rows if row["faithful"]), key=lambda row: row["steps_per_second"]
-        )
-        single = next(row for row in rows if row["iterations"] == 1)
-        lines += [_settings(row, rows[0]) for row in (rows[0], best, single)]
+        rows: dict[tuple[str, int, int], dict[str, Any]] = {}
+        for row in result["rows"]:
+            settings = row["solver"], row["iterations"], row["ls_iterations"]
+            rows.setdefault(settings, {})[row["engine"]] = row
+        strict = next(iter(rows))
+        faithful = [name for name, of in rows.items() if all(r["faithful"] for r in of.values())]
+        best = max(faithful, key=lambda name: rows[name]["mjx"]["steps_per_second"])
+        single = next(name for name in rows if name[1] == 1)
+        lines += [
+            _settings(rows[name], rows[strict], best)
+            for name in dict.fromkeys((strict, best, single))
+        ]
     columns = (
         "target of",
         "solver",
-        *(f"velocity error, {steps}" for steps in ("1 step", "5 steps", "50 steps")),
+        *(f"MJX, {steps}" for steps in ("1 step", "5 steps", "50 steps")),
+        *(f"C, {steps}" for steps in ("1 step", "5 steps", "50 steps")),
         "growth of 1e-7, 50 steps",
         "not finite",
-        "speed",
-        "faithful",
+        "speed of MJX",
+        "of C",
+        "faithful in",
     )
     machine = results[0]["machine"]
     commits = ", ".join(sorted({result["git"]["commit"][:7] for result in results}))
@@ -217,15 +225,24 @@ def fidelity() -> str:
     )
 
 
-def _settings(row: dict[str, Any], strict: dict[str, Any]) -> tuple[str, ...]:
+def _settings(
+    engines: dict[str, Any], strict: dict[str, Any], best: tuple[str, int, int]
+) -> tuple[str, ...]:
+    mjx = engines["mjx"]
+    settings = mjx["solver"], mjx["iterations"], mjx["ls_iterations"]
+    name = "{} {}/{}".format(*settings)
+    trusted = [{"mjx": "MJX", "mujoco": "C"}[e] for e, row in engines.items() if row["faithful"]]
     return (
-        row["pair"],
-        f"{row['solver']} {row['iterations']}/{row['ls_iterations']}",
-        *(f"{row['qvel_error'][horizon]:.0e}" for horizon in ("1", "5", "50")),
-        f"{row['qvel_growth']['50']:.0e}",
-        str(row["not_finite"]),
-        f"{row['steps_per_second'] / strict['steps_per_second']:.1f} x",
-        "yes" if row["faithful"] else "no",
+        mjx["pair"],
+        f"**{name}**" if settings == best else name,
+        *(f"{row['qvel_error'][h]:.0e}" for row in engines.values() for h in ("1", "5", "50")),
+        f"{mjx['qvel_growth']['50']:.0e}",
+        str(sum(row["not_finite"] for row in engines.values())),
+        *(
+            f"{row['steps_per_second'] / strict[engine]['steps_per_second']:.1f} x"
+            for engine, row in engines.items()
+        ),
+        " and ".join(trusted) or "neither",
     )
 
 

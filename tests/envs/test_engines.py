@@ -20,8 +20,9 @@ TOLERANCES = {
     "half_cheetah": (1e-3, 1e-2),  # 3e-4, 2e-3
     "walker2d": (4e-4, 4e-4),  # 1e-4, 1e-4
 }
-DOUBLE = 2e-7
-"""The same in float64, for all; measured: up to 5e-8."""
+DOUBLE = 6e-6
+"""The same in float64, for all; measured: up to 1.4e-6, where a contact of Hopper's opens on the
+way, 5e-8 elsewhere."""
 
 
 def states_on_the_way(world) -> dynamics.PhysicsState:
