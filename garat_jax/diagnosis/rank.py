@@ -249,8 +249,10 @@ def _prune(problem: Problem, steps: list[Step], current: Fit, tried: list[Step],
     """Drop those effects that became superfluous: without them the cost stays as it is."""
     kept = steps
     for step in tried:
-        say(f"trying without {step.candidate.named}")
         others = [s.effect for s in kept if s.effect != step.effect]
+        if not others:
+            break
+        say(f"trying without {step.candidate.named}")
         without = _fit_only(problem, current, others, current.cost[problem.fitted].sum())
         if not leads(problem, current, without):
             kept = [other for other in kept if other.effect != step.effect]
