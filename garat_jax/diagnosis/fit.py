@@ -109,7 +109,7 @@ def fit(
     theta,
     start,
     free,
-    iterations: int = 12,
+    iterations: int = 24,
     rival: float = np.inf,
     sensitivity: np.ndarray | None = None,
 ) -> Fit:

@@ -172,7 +172,7 @@ def test_the_command_writes_the_diagnosis_and_a_report(tmp_path):
 
     hidden = make_recordings(PENDULUM, tmp_path / "data", 22, kind="torque_offset", **FASTEST)
     run = RunDirectory.create(tmp_path / "run", {}, "garat diagnose", [])
-    found = run_diagnose(PENDULUM, (*hidden.fit, *hidden.holdout), (), run)
+    found = run_diagnose(PENDULUM, (*hidden.fit, *hidden.holdout), (), run).diagnosis
     assert found.selected[0].effect == "torque_offset"
     assert run.read_json("diagnosis.json")["holdout"] == ["recording_2.csv"]
     assert (run.root / "report.html").is_file()
