@@ -43,6 +43,7 @@ def run_case(name: str, folder: Path, out: Path, command: str) -> dict[str, Any]
     sections = diagnosis_sections(result, model, fit, holdout)
     write_diagnosis(run, result, model.name, sections)
     sys.stdout.write(f"{name}\n{result}\n\n")
+    said = ("effect", "target", "share", "error_after", "passes", "why")
     row = {
         "case": name,
         "verdict": result.verdict,
@@ -50,10 +51,7 @@ def run_case(name: str, folder: Path, out: Path, command: str) -> dict[str, Any]
             {"effect": c.effect, "target": c.target, **c.parameters} for c in result.selected
         ],
         "error": result.error,
-        "first_candidates": [
-            {"effect": c.effect, "target": c.target, "error_after": c.error_after, "why": c.why}
-            for c in result.candidates[:4]
-        ],
+        "candidates": [{name: getattr(c, name) for name in said} for c in result.candidates],
         "seconds": result.seconds,
     }
     return finite_or_null(to_plain(row))
