@@ -29,8 +29,8 @@ HORIZONS = (2.0, 1.0, 0.5, 0.3, 0.2)
 """Seconds that a segment may last, longest first."""
 PERTURBATIONS = (1e-5, 1e-2)
 """Changes of the initial states whose growth is measured, relative to their spread; the smaller one
-counts. Where contacts chatter at the model's timestep, a small change may grow much by an accident
-that a large one has at every start, but then not by so much of its own size."""
+counts. Contacts that chatter at the model's timestep make jumps of one size, much beside a small
+change, which seldom makes any, and little beside a large one."""
 LARGEST_GROWTH = 4.0
 """Growth of a small perturbation within a segment; above it sensitivities cease to be linear."""
 LARGEST_ERROR = 0.2
@@ -156,7 +156,7 @@ def choose_horizon(simulator: Predictor, recordings, grid) -> tuple[float, Segme
 
     Growth is the change of the signals after a small change of the initial state, both relative to
     the signals' spread; the error is that of the model from the measured initial state, less what
-    noise makes of it, in signals whose spread is `QUIET` times their noise, if there are any.
+    noise makes of it, in signals that spread beyond `QUIET` times their noise, if there are any.
     """
     longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
     horizons = [h for h in HORIZONS if h <= max(longest, HORIZONS[-1])]

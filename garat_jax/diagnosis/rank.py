@@ -315,22 +315,24 @@ def _instead_of(old: Candidate, new: Candidate) -> Candidate:
 
 def _fit_instead(problem: Problem, current: Fit, others: Sequence[int], instead: Contender) -> Fit:
     """Fit again with the effects `others` and with what was fitted `instead` of the rest."""
-    columns = list(instead.score.columns)
-    present = np.asarray([slot.effect in others for slot in problem.simulator.slots])
-    theta = np.where(present, current.theta, problem.simulator.base)
+    columns, rival = list(instead.score.columns), current.cost[problem.fitted].sum()
+    theta, free = _only(problem, current, others)
     theta[columns] = instead.fit.theta[columns]
-    free = [*(j for j in current.free if present[j]), *columns]
-    rival = current.cost[problem.fitted].sum()
+    free += columns
     return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
 
 
 def _fit_only(problem: Problem, current: Fit, effects: Sequence[int], rival=np.inf) -> Fit:
     """Fit again with some of the selected effects, the others back at no effect."""
-    slots = problem.simulator.slots
-    present = np.asarray([slot.effect in effects for slot in slots])
-    theta = np.where(present, current.theta, problem.simulator.base)
-    free = [j for j in current.free if present[j]]
+    theta, free = _only(problem, current, effects)
     return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
+
+
+def _only(problem: Problem, current: Fit, effects: Sequence[int]) -> tuple[np.ndarray, list[int]]:
+    """Return parameters at which only some effects act, and which of theirs are fitted."""
+    present = np.asarray([slot.effect in effects for slot in problem.simulator.slots])
+    theta = np.where(present, current.theta, problem.simulator.base)
+    return theta, [j for j in current.free if present[j]]
 
 
 def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
