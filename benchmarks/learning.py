@@ -6,14 +6,14 @@ observations are normalised like ours, which it leaves to its user, and its line
 library has it. Its seeds run in `--jobs` processes. Both learn in two trust regions: the paper's,
 and that of the peer's user who gives it the paper's number, which it takes for a mean over the
 actions' components and not their sum. Ours also learns in the targets of the pairs, which it should
-solve. `--extend` keeps the rows of the result file and adds what it lacks; each names its commit.
+solve, for longer where a million steps are not enough. `--extend` keeps the rows of the result file
+and adds what it lacks; each names its commit.
 """
 
 # pyright: reportMissingImports=false
 import concurrent.futures
 import dataclasses
 import importlib.metadata
-import itertools
 import json
 import multiprocessing
 import warnings
@@ -41,6 +41,8 @@ NAME = "learning"
 POINTS = 4
 """How often in the training the policies are evaluated, evenly."""
 EPISODES = 50
+TIMES = {"ant": 6}
+"""How many times as long ours learns in some targets, at most."""
 WITHIN = 0.1
 """Ours may lie below the peer's mean return by this share of it."""
 OURS, PEER = "garat_jax trpo", "sb3-contrib trpo"
@@ -164,19 +166,26 @@ def _key(row: dict[str, Any]) -> tuple[str, str, float]:
     return row["env"], row["agent"], row["max_kl"]
 
 
-def recorded_rows(arguments: Arguments) -> Kept:
-    """Return the rows of the result file.
+def target_steps(arguments: Arguments, name: str) -> int:
+    """Return how many steps ours learns in the target of a pair."""
+    return TIMES.get(name, 1) * arguments.steps
 
-    Raises:
-        SystemExit: They have another number of seeds or steps.
-    """
-    path = arguments.out / f"{NAME}.json"
-    result = json.loads(path.read_text(encoding="utf-8"))
-    rows = [*result["rows"], *result["targets"]]
-    sizes = {(len(row["solved"]), row["steps"][-1]) for row in rows}
-    if sizes - {(arguments.seeds, arguments.steps)}:
-        raise SystemExit(f"--extend: {path} has (seeds, steps) {sorted(sizes)}; give the same")
-    return {_key(row): row for row in rows}
+
+def recorded(arguments: Arguments) -> tuple[Kept, Kept]:
+    """Return the rows of the result file, of worlds and of targets, of as many seeds and steps."""
+    text = (arguments.out / f"{NAME}.json").read_text(encoding="utf-8")
+    result, seeds = json.loads(text), arguments.seeds
+    worlds = [row for row in result["rows"] if _size(row) == (seeds, arguments.steps)]
+    targets = [
+        row
+        for row in result["targets"]
+        if _size(row) == (seeds, target_steps(arguments, row["env"]))
+    ]
+    return {_key(row): row for row in worlds}, {_key(row): row for row in targets}
+
+
+def _size(row: dict[str, Any]) -> tuple[int, int]:
+    return len(row["solved"]), row["steps"][-1]
 
 
 def measure(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]]:
@@ -210,41 +219,42 @@ def measure_targets(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]
     config = TRPOConfig()
     for name in arguments.pairs:
         _, target = PAIRS[name].worlds("mujoco")
-        solved = target.env.task.solved_return
+        solved, steps = target.env.task.solved_return, target_steps(arguments, name)
         yield kept.get((name, OURS, config.max_kl)) or row_of(
-            name,
-            OURS,
-            config,
-            solved,
-            learn(target, config, arguments.seeds, arguments.steps),
-            arguments.steps,
+            name, OURS, config, solved, learn(target, config, arguments.seeds, steps), steps
         )
 
 
-def write(arguments: Arguments, rows: list[dict[str, Any]]) -> Path:
+def write(arguments: Arguments, rows: Kept, targets: Kept) -> Path:
     """Write all rows so far."""
     details = {
         "peer": {k: importlib.metadata.version(k) for k in ("sb3-contrib", "torch")},
         "within": WITHIN,
         "episodes": EPISODES,
-        "targets": [row for row in rows if row["env"] in PAIRS],
+        "targets": [*targets.values()],
     }
-    rows = [row for row in rows if row["env"] in ENVS]
-    command, seeds = command_line(), range(arguments.seeds)
     return write_result(
-        NAME, rows, seeds=seeds, command=command, details=details, folder=arguments.out
+        NAME,
+        [*rows.values()],
+        seeds=range(arguments.seeds),
+        command=command_line(),
+        details=details,
+        folder=arguments.out,
     )
 
 
 def main() -> None:
     arguments = tyro.cli(Arguments)
-    kept = recorded_rows(arguments) if arguments.extend else {}
-    rows: list[dict[str, Any]] = []
-    for row in itertools.chain(measure(arguments, kept), measure_targets(arguments, kept)):
-        rows.append(row)
-        kept.pop(_key(row), None)
-        path = write(arguments, [*rows, *kept.values()])  # so that --extend can go on from here
-        print(path, flush=True)
+    rows, targets = recorded(arguments) if arguments.extend else ({}, {})
+    for measured, into in (
+        (measure(arguments, rows), rows),
+        (measure_targets(arguments, targets), targets),
+    ):
+        for row in measured:
+            into.pop(_key(row), None)  # rows stand in the order of measuring
+            into[_key(row)] = row
+            path = write(arguments, rows, targets)  # so that --extend can go on from here
+            print(path, flush=True)
 
 
 if __name__ == "__main__":

@@ -135,14 +135,16 @@ def _targets(result: dict[str, Any]) -> str:
     lines = [
         (
             row["env"],
+            f"{row['steps'][-1]:,}",
             *(f"{sum(returns) / len(returns):,.4g}" for returns in row["returns"]),
             f"{row['solved_return']:,.4g}",
             f"{sum(row['solved'])} of {len(row['solved'])}",
         )
         for row in result["targets"]
     ]
-    steps = [f"{steps:,} steps" for steps in result["targets"][0]["steps"]]
-    columns = ("target of", *steps, "solved from", "seeds that solve it")
+    points = len(result["targets"][0]["steps"])
+    parts = [f"after {100 * (k + 1) // points} %" for k in range(points)]
+    columns = ("target of", "steps", *parts, "solved from", "seeds that solve it")
     return table(columns, lines) + commits(result["targets"])
 
 

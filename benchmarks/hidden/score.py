@@ -11,12 +11,12 @@ from scipy import stats
 
 from garat_jax.diagnosis import Diagnosis, Model, Recording
 from garat_jax.diagnosis.diagnose import split, thin
-from garat_jax.diagnosis.fit import settle
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Candidate, Named
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
 from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE
 
