@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.diagnose import choose_horizon, thin
-from garat_jax.diagnosis.fit import Fit, count_timestep, fit, settle
+from garat_jax.diagnosis.diagnose import thin
+from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.horizon import choose_horizon
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
@@ -15,6 +16,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Estimate
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.effects import Effect, unit_at
 from garat_jax.errors import UserError, choose
 

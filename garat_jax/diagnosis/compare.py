@@ -13,8 +13,8 @@ import plotly.graph_objects as go
 
 from garat_jax import report
 from garat_jax.diagnosis import figures
-from garat_jax.diagnosis.diagnose import choose_horizon, thin
-from garat_jax.diagnosis.fit import settle
+from garat_jax.diagnosis.diagnose import thin
+from garat_jax.diagnosis.horizon import choose_horizon
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording
@@ -28,6 +28,7 @@ from garat_jax.diagnosis.residuals import Residuals, examine
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.torque import TorqueError, compare_torques
 from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE

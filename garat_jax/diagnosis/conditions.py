@@ -12,8 +12,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from garat_jax.diagnosis.diagnose import UNEXPLAINED, choose_horizon, diagnose, split, thin
+from garat_jax.diagnosis.diagnose import UNEXPLAINED, diagnose, split, thin
 from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.horizon import choose_horizon
 from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
@@ -129,17 +130,18 @@ class JointSimulator:
         conditions = self._condition[segments.recording]
         for number in np.unique(conditions):
             here = conditions == number
-            there = self._under(theta, int(number))
+            own = theta[:, here] if theta.ndim > 2 else theta
+            there = self._under(own, int(number))
             result[:, here] = self._simulator.predict(there, start[:, here], segments.take(here))
         return result
 
     def _under(self, theta: np.ndarray, condition: int) -> np.ndarray:
-        """Return the parameters of one condition [P, columns] from all [P, num_parameters]."""
-        own = np.tile(self._simulator.base, (len(theta), 1))
+        """Return the parameters of one condition [.., columns] from all [.., num_parameters]."""
+        own = np.tile(self._simulator.base, (*theta.shape[:-1], 1))
         for owner in (0, condition):
             for j, place in enumerate(self._places):
                 if place.condition == owner:
-                    own[:, place.column] = theta[:, j]
+                    own[..., place.column] = theta[..., j]
         return own
 
 

@@ -9,36 +9,23 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.drift import find_drifts
-from garat_jax.diagnosis.fit import settle
+from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import SMALLEST_SHARE
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, signals
 from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.problem import Predictor, Problem
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
-from garat_jax.diagnosis.segments import QUIET, Segments, choose_grid, cut
+from garat_jax.diagnosis.segments import QUIET, choose_grid
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
 from garat_jax.provenance import versions
 
-HORIZONS = (2.0, 1.0, 0.5, 0.3, 0.2)
-"""Seconds that a segment may last, longest first."""
-PERTURBATIONS = (1e-5, 1e-2)
-"""Changes of the initial states whose growth is measured, relative to their spread; the smaller one
-counts. Contacts that chatter at the model's timestep make jumps of one size, much beside a small
-change, which seldom makes any, and little beside a large one."""
-LARGEST_GROWTH = 4.0
-"""Growth of a small perturbation within a segment; above it sensitivities cease to be linear."""
-LARGEST_ERROR = 0.2
-"""Error within a segment, relative to the signal's spread, for the same reason."""
-BEYOND = 4.0
-"""Standard deviations of its noise that the error of a signal may reach by noise alone."""
-MOST = 0.9
-"""Share of the segments that must keep below both."""
 ENOUGH = 250.0
 """Samples a second that a passive mechanism needs."""
 UNEXPLAINED = 0.3
@@ -71,7 +58,7 @@ def diagnose(
     others = make_candidates(whole, native_model(model.compile(engine="mujoco")))
     grid = choose_grid(everything, host.opt.timestep)
     say("choosing the horizon")
-    horizon, segments = choose_horizon(Simulator(whole, (), grid), everything, grid)
+    _, segments = choose_horizon(Simulator(whole, (), grid), everything, grid)
     simulator, finer = (
         Simulator(model, (*shared, *others), grid, refine, acting=range(len(shared)))
         for refine in (1, 2)
@@ -81,8 +68,9 @@ def diagnose(
     say("the model as it is")
     settled = settle(problem, simulator.base, segments.start)
     problem = trusted(problem, settled)
-    outcome = explain(problem, settled.start, say)
-    error = _errors(problem, outcome, host, f"{how}, segments of {horizon:g} s")
+    outcome = explain(problem, settled.start, say, lambda p, t: cut_longer(p, everything, grid, t))
+    problem = outcome.problem
+    error = _errors(problem, outcome, host, f"{how}, segments of {problem.horizon:.2g} s")
     return Diagnosis(
         model=str(model.path),
         data=tuple(r.name for r in fitted),
@@ -149,48 +137,6 @@ def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
                 continue
             candidates.append(cls(target=target, **cls.at(host, target)))
     return tuple(candidates)
-
-
-def choose_horizon(simulator: Predictor, recordings, grid) -> tuple[float, Segments]:
-    """Choose the longest horizon over which fits are nearly linear, and cut there.
-
-    Growth is the change of the signals after a small change of the initial state, both relative to
-    the signals' spread; the error is that of the model from the measured initial state, less what
-    noise makes of it, in signals that spread beyond `QUIET` times their noise, if there are any.
-    """
-    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
-    horizons = [h for h in HORIZONS if h <= max(longest, HORIZONS[-1])]
-    segments = cut(recordings, grid, horizons[0])
-    sample = grid.interval * grid.per_sample
-    growth, error = _growth_and_error(simulator, segments)
-    limits = np.stack([growth / LARGEST_GROWTH, error / LARGEST_ERROR])
-    horizon = horizons[-1]
-    for horizon in horizons:
-        within = limits[:, :, : max(2, round(horizon / sample))].max(axis=2)
-        if np.all(np.quantile(within, MOST, axis=1, method="higher") <= 1.0):
-            break
-    return horizon, segments if horizon == horizons[0] else cut(recordings, grid, horizon)
-
-
-def _growth_and_error(simulator: Predictor, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest of any signal, each [S, L]; see `choose_horizon`."""
-    unit = np.diag(segments.start_unit)
-    steps = [np.zeros((1, len(unit))), *(size * unit for size in PERTURBATIONS)]
-    starts = segments.start + np.concatenate(steps)[:, None]
-    thetas = np.tile(simulator.base, (len(starts), 1))
-    predicted = simulator.predict(thetas, starts, segments)
-    moves = segments.spread > QUIET * segments.noise
-    seen = moves if np.any(moves) else np.ones_like(moves)
-    change = np.abs(predicted[1:] - predicted[0]) / segments.spread
-    by_size = zip(np.split(change, len(PERTURBATIONS)), PERTURBATIONS, strict=True)
-    growth = np.min([_or_inf(part.max(axis=(0, 3)) / size) for part, size in by_size], axis=0)
-    error = np.maximum(np.abs(predicted[0] - segments.measured) - BEYOND * segments.noise, 0.0)
-    error = (error * segments.weight[..., None] / segments.spread)[..., seen].max(axis=2)
-    return growth, _or_inf(error)
-
-
-def _or_inf(sizes: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(sizes), sizes, np.inf)
 
 
 def _verdict(outcome: Outcome, error: Errors) -> Verdict:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
-from garat_jax.diagnosis.fit import STEP, Fit
+from garat_jax.diagnosis.fit import STEP
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.problem import (
     Problem,
@@ -21,6 +21,7 @@ from garat_jax.diagnosis.problem import (
 )
 from garat_jax.diagnosis.results import Drift, Estimate
 from garat_jax.diagnosis.robust import regress
+from garat_jax.diagnosis.starts import Fit
 from garat_jax.effects import unit_at
 
 SIGNIFICANCE = 0.01

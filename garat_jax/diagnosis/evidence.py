@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.fit import Fit
 from garat_jax.diagnosis.problem import (
     Problem,
     StartSpace,
@@ -20,6 +19,7 @@ from garat_jax.diagnosis.problem import (
 )
 from garat_jax.diagnosis.robust import orthonormal, wald_test, without
 from garat_jax.diagnosis.simulate import Simulator, columns_of
+from garat_jax.diagnosis.starts import Fit
 
 DELAYS = ("actuator_delay", "sensor_delay")
 """Kinds that a common delay stands for: it is no nuisance to them."""

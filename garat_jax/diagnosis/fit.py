@@ -25,8 +25,12 @@ from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.starts import (
     KEPT_PROMISE,
     SETTLE_STEPS,
+    Fit,
     choose,
+    follow,
+    follow_each,
     promised_costs,
+    settle,
     settle_anew,
     settle_starts,
     start_step,
@@ -58,50 +62,6 @@ BEATEN = 2.0
 """Cost, relative to another fit's, above which a fit is not worth its last steps."""
 EXTRAPOLATED = 0.1
 """Share of the shift to a timestep of 0 that is uncertain: it is extrapolated from half of one."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Fit:
-    """Parameters, initial states and what is left of the residual.
-
-    Attributes:
-        theta: All parameters, [num_parameters].
-        free: Indices of those that were fitted.
-        frozen: Indices that the data do not excite; they kept their values.
-        start: Initial states, [S, nq + nv].
-        residual: Whitened, [S, N].
-        sensitivity: Its derivatives by the initial states, [S, N, nq + nv].
-        low: Lower ends of the free parameters' 95 % intervals, at the model's own timestep; see
-            `count_timestep`.
-        high: Upper ends.
-    """
-
-    theta: np.ndarray
-    free: tuple[int, ...]
-    frozen: tuple[int, ...]
-    start: np.ndarray
-    residual: np.ndarray
-    sensitivity: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-    @property
-    def cost(self) -> np.ndarray:
-        """Sum of squares of each segment, [S]."""
-        return np.sum(self.residual**2, axis=1)
-
-
-def settle(problem: Problem, theta: np.ndarray, start: np.ndarray, iterations: int = 8) -> Fit:
-    """Estimate the initial state of every segment at fixed parameters.
-
-    Each segment has a damping of its own and is done when its linearisation promises no fall of
-    its cost that matters; a step that was rejected is tried again, shorter.
-    """
-    lin = linearise(problem, theta, start, (), ())
-    start, lin = settle_starts(problem, theta, start, lin, iterations)
-    start, lin = settle_anew(problem, theta, start, lin)
-    nothing = np.zeros(0)
-    return Fit(theta, (), (), start, lin.residual, lin.start, nothing, nothing)
 
 
 def fit(
@@ -140,7 +100,7 @@ def fit(
         start, settled, _ = _settle_all(problem, theta, descended, lin)
     cost = settled.residual[problem.fitted] ** 2
     if np.sum(cost) < SEARCHED_WITHIN * rival and _is_erratic(problem, theta, descended, free, lin):
-        near, lin, keep = _fit_across_contacts(problem, theta, start, free)
+        near, lin, keep = _fit_across_contacts(problem, settle(problem, theta, start), free)
         theta, start, settled = near.theta, near.start, lin._replace(start=near.sensitivity)
     low, high = _interval(problem, theta, lin, free, keep)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
@@ -173,47 +133,41 @@ def _is_erratic(problem: Problem, theta, start, free, lin: Linearisation) -> boo
     return bool(np.any(alike[keep] < ALIKE))
 
 
-def _wide(problem: Problem, theta, start, free) -> tuple[Fit, Linearisation]:
+def _wide(problem: Problem, near: Fit, free) -> Linearisation:
     """Measure sensitivities over wide steps, initial states settled at both ends of each.
 
     Contacts that open or close a step of the engine earlier change what follows by an amount that
     does not shrink with the perturbation; over a wide one these changes average out. What initial
     states do is in these sensitivities already: those to them are 0.
     """
-    base = _follow(problem, theta, settle(problem, theta, start))
-    columns = []
-    for j, step in zip(free, difference_steps(problem, theta, free, WIDE), strict=True):
-        moved = theta.copy()
-        moved[j] += step
-        columns.append((_follow(problem, moved, base).residual - base.residual) / step)
-    nothing = np.zeros_like(base.sensitivity)
-    return base, Linearisation(base.residual, np.stack(columns, -1), nothing)
+    steps = difference_steps(problem, near.theta, free, WIDE)
+    thetas = np.tile(near.theta, (len(free), 1))
+    thetas[np.arange(len(free)), list(free)] += steps
+    moved = follow_each(problem, thetas, near)
+    columns = [(far.residual - near.residual) / h for far, h in zip(moved, steps, strict=True)]
+    nothing = np.zeros_like(near.sensitivity)
+    return Linearisation(near.residual, np.stack(columns, -1), nothing)
 
 
-def _follow(problem: Problem, theta, near: Fit) -> Fit:
-    """Settle the initial states at parameters near those of a fit, with its sensitivities."""
-    lin = linearise(problem, theta, near.start, (), (), near.sensitivity)
-    start, lin = settle_starts(problem, theta, near.start, lin, SETTLE_STEPS)
-    return dataclasses.replace(
-        near, theta=theta, start=start, residual=lin.residual, sensitivity=lin.start
-    )
-
-
-def _fit_across_contacts(problem: Problem, theta, start, free):
+def _fit_across_contacts(problem: Problem, near: Fit, free):
     """Search if more is left than noise, and take a Gauss-Newton step with `_wide` differences.
+
+    Args:
+        problem: What is fitted.
+        near: What Gauss-Newton steps have reached, initial states settled.
+        free: Indices of the parameters to fit.
 
     Returns:
         The best that was reached, the linearisation there, and which parameters are excited.
     """
-    near = settle(problem, theta, start)
     if _cost(problem, near) > SEARCHED_ABOVE * problem.expected[problem.fitted].sum():
-        found = settle(problem, _search(problem, theta, start, free), start)
+        found = settle(problem, _search(problem, near, free), near.start)
         near = min((near, found), key=partial(_cost, problem))
-    near, lin = _wide(problem, near.theta, near.start, free)
+    lin = _wide(problem, near, free)
     change, keep = _parameter_step(problem, near.theta, lin, free, 1e-4)
     theta = near.theta.copy()
     theta[list(free)] += change
-    near = min((near, _follow(problem, theta, near)), key=partial(_cost, problem))
+    near = min((near, follow(problem, theta, near)), key=partial(_cost, problem))
     return near, lin._replace(residual=near.residual), keep
 
 
@@ -221,28 +175,27 @@ def _cost(problem: Problem, of: Fit) -> float:
     return float(of.cost[problem.fitted].sum())
 
 
-def _search(problem: Problem, theta, start, free) -> np.ndarray:
+def _search(problem: Problem, near: Fit, free) -> np.ndarray:
     """Fit parameters to some of the segments by compass search, initial states settled each time.
 
     (Kolda, Lewis and Torczon 2003.) No derivative is trusted; steps double and shrink.
     """
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SEARCHED)]
-    problem = problem.take(chosen)
-    steps = np.abs(difference_steps(problem, theta, free, WIDE))
-    least, near = FINEST * steps, _follow(problem, theta, settle(problem, theta, start[chosen]))
+    problem, near = problem.take(chosen), near.take(chosen)
+    steps = np.abs(difference_steps(problem, near.theta, free, WIDE))
+    least = FINEST * steps
+    parameters = [problem.simulator.slots[j].parameter for j in free]
+    low, high = ([getattr(p, end) for p in parameters] for end in ("low", "high"))
+    ways = np.concatenate([-np.eye(len(free)), np.eye(len(free))])
     for _ in range(SEARCH_STEPS):
-        best, along = near, -1
-        for number, (j, step) in enumerate(zip(free, steps, strict=True)):
-            p = problem.simulator.slots[j].parameter
-            for way in (-1.0, 1.0):
-                theta = near.theta.copy()
-                theta[j] = np.clip(theta[j] + way * step, p.low, p.high)
-                trial = _follow(problem, theta, near)
-                if trial.cost.sum() < best.cost.sum():
-                    best, along = trial, number
-        if best.cost.sum() < SEARCH_ON * near.cost.sum():
-            near, steps[along] = best, 2.0 * steps[along]
+        thetas = np.tile(near.theta, (len(ways), 1))
+        thetas[:, free] = np.clip(thetas[:, free] + ways * steps, low, high)
+        trials = follow_each(problem, thetas, near)
+        costs = [trial.cost.sum() for trial in trials]
+        along = int(np.argmin(costs))
+        if costs[along] < SEARCH_ON * near.cost.sum():
+            near, steps[along % len(free)] = trials[along], 2.0 * steps[along % len(free)]
         elif np.all(steps <= least):
             break
         else:
@@ -366,7 +319,7 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     steps = difference_steps(problem, theta, free, STEP)
     lin = linearise(problem, theta, start, free, steps)
     if _is_erratic(problem, theta, start, free, lin):
-        _, lin = _wide(problem, theta, start, free)
+        lin = _wide(problem, fitted, free)
     halved = problem.integrator_error(theta, start, fitted.residual)
     near = lin._replace(start=fitted.sensitivity)
     sensitivity, change = _projected(problem, near._replace(residual=2.0 * halved))
@@ -384,9 +337,7 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     timeless = lin._replace(residual=fitted.residual + 2.0 * halved)
     low, high = _interval(problem, moved, timeless, free, keep)
     unsure = EXTRAPOLATED * np.abs(shift)
-    return dataclasses.replace(
-        _follow(problem, moved, fitted), low=low - unsure, high=high + unsure
-    )
+    return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
 
 
 def _does_as_promised(problem: Problem, half: Linearisation, theta, start, free, shift) -> bool:

@@ -9,9 +9,9 @@ import numpy as np
 
 from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.diagnose import choose_horizon, diagnose, is_explained, split, thin
+from garat_jax.diagnosis.diagnose import diagnose, is_explained, split, thin
 from garat_jax.diagnosis.export import copy_model
-from garat_jax.diagnosis.fit import settle
+from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, load_model, save_card
@@ -22,6 +22,7 @@ from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosi
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.view import repaired
 from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue
@@ -145,13 +146,15 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     _, segments = choose_horizon(simulator, everything, grid)
     seen = segments.recording < len(fitted)
     problem = Problem(simulator, simulator, segments, seen, grid.interval * grid.per_sample)
-    metric = make_metric(problem)
-    final, start = found_theta(simulator, added), segments.start
+    final = found_theta(simulator, added)
+    if longer := cut_longer(problem, everything, grid, final):
+        problem, _ = longer
+    seen, segments, metric = problem.fitted, problem.segments, make_metric(problem)
     owners = np.asarray([slot.effect for slot in simulator.slots])
     rungs, by_signal = [], []
     for count in range(len(added) + 1):
         theta = np.where(owners < count, final, simulator.base)
-        settled = settle(problem, theta, start)
+        settled = settle(problem, theta, segments.start)
         errors = metric.error(settled.residual, seen), metric.error(settled.residual, ~seen)
         rungs.append(Rung(added[count - 1] if count else None, *errors))
         by_signal.append(metric.by_signal(settled.residual, ~seen) * segments.noise)

@@ -50,7 +50,13 @@ class Predictor(Protocol):
         ...
 
     def predict(self, theta: np.ndarray, start: np.ndarray, segments: Segments) -> np.ndarray:
-        """Predict every segment's signals, [P, S, L, num_signals]."""
+        """Predict every segment's signals, [P, S, L, num_signals].
+
+        Args:
+            theta: Parameters, [P, num_parameters] or, each segment its own, [P, S, ..].
+            start: Initial states, [P, S, nq + nv].
+            segments: Commands and sample times.
+        """
         ...
 
 
@@ -74,6 +80,11 @@ class Problem(Generic[AnySimulator]):
     segments: Segments
     fitted: np.ndarray
     interval: float
+
+    @property
+    def horizon(self) -> float:
+        """Seconds of a segment."""
+        return self.segments.measured.shape[1] * self.interval
 
     def take(self, chosen: np.ndarray) -> "Problem[AnySimulator]":
         """Return the problem of some of the segments."""
@@ -106,7 +117,7 @@ class Problem(Generic[AnySimulator]):
     def scale(self) -> np.ndarray:
         """Return what a deviation counts, [S, L, num_signals]."""
         s = self.segments
-        return (s.weight * s.trust)[..., None] / s.noise
+        return s.weight[..., None] * s.trust / s.noise
 
     @property
     def expected(self) -> np.ndarray:
@@ -132,6 +143,9 @@ class Problem(Generic[AnySimulator]):
         return np.repeat(block, num_signals)
 
 
+AnyProblem = TypeVar("AnyProblem", bound=Problem)
+
+
 class Linearisation(NamedTuple):
     """Residuals and sensitivities at one point.
 
@@ -154,7 +168,7 @@ def linearise(
 
     Args:
         problem: What is fitted.
-        theta: All parameters, [num_parameters].
+        theta: All parameters, [num_parameters] or, each segment its own, [S, num_parameters].
         start: Initial states, [S, nq + nv].
         columns: Indices of the parameters to perturb.
         steps: Their perturbations.
@@ -163,8 +177,9 @@ def linearise(
     """
     unit = problem.segments.start_unit
     num_start = len(unit) if sensitivity is None else 0
-    thetas = np.tile(theta, (1 + len(columns) + num_start, 1))
-    thetas[1 + np.arange(len(columns)), list(columns)] += steps
+    thetas = np.tile(theta, (1 + len(columns) + num_start, *np.ones(np.ndim(theta), int)))
+    for i, (j, step) in enumerate(zip(columns, steps, strict=True)):
+        thetas[1 + i, ..., j] += step
     starts = np.tile(start, (len(thetas), 1, 1))
     for i in range(num_start):
         starts[1 + len(columns) + i, :, i] += START_STEP * unit[i]

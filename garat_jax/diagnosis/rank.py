@@ -20,39 +20,20 @@ from garat_jax.diagnosis.contend import (
     with_evidence,
     with_twins,
 )
-from garat_jax.diagnosis.fit import Fit, count_timestep, fit, settle
+from garat_jax.diagnosis.fit import count_timestep, fit
 from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD, Judged, estimates, judge, leads
-from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor
+from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor, trusted
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Candidate, Named
 from garat_jax.diagnosis.screen import Score, screen
+from garat_jax.diagnosis.starts import Fit, settle
+from garat_jax.diagnosis.steps import Step, prune, refitted, swap
 
 REFINED_ABOVE = 1.1
 """Multiple of the noise floor above which refinements of the best law are tried."""
 RIVALS = 2
 """How many candidates behind the first are followed for one more effect."""
 ROUNDS = 5
-
-
-class Step(NamedTuple):
-    """One effect that was added.
-
-    Attributes:
-        candidate: What was said of it.
-        contender: How it was fitted then.
-        fit: The fit with it and those before it.
-        alike: What the recordings could not tell from it then.
-    """
-
-    candidate: Candidate
-    contender: Contender
-    fit: Fit
-    alike: Sequence[tuple[Candidate, Contender]]
-
-    @property
-    def effect(self) -> int:
-        """Its index among the simulator's."""
-        return self.contender.score.effect
 
 
 class Path(NamedTuple):
@@ -89,6 +70,7 @@ class Outcome(NamedTuple):
     """What forward selection found.
 
     Attributes:
+        problem: The recordings, cut as long as the model with what was found can be followed.
         before: The model as it is, initial states settled.
         after: With all selected effects.
         candidates: The first round's candidates, best first.
@@ -100,6 +82,7 @@ class Outcome(NamedTuple):
             that was not; None where nothing is left or nothing was fitted.
     """
 
+    problem: Problem
     before: Fit
     after: Fit
     candidates: tuple[Candidate, ...]
@@ -110,22 +93,92 @@ class Outcome(NamedTuple):
     best: Fit | None
 
 
-def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> Outcome:
+class Selection(NamedTuple):
+    """What was added on one cut of the recordings.
+
+    Attributes:
+        problem: The recordings, cut.
+        steps: The effects added, in order, each with the fit at the time.
+        fit: The fit with all of them.
+        timeless: The same counted to a timestep of 0, if that is known already.
+        floor: Noise floor on the held-out segments.
+        candidates: The first round's candidates, best first.
+        best: The fit of the last round's first candidate, if that was fitted.
+    """
+
+    problem: Problem
+    steps: list[Step]
+    fit: Fit
+    timeless: Fit | None
+    floor: Floor
+    candidates: tuple[Candidate, ...]
+    best: Fit | None
+
+
+def explain(
+    problem: Problem,
+    start: np.ndarray,
+    say: Callable[[str], None],
+    cut_longer: Callable[[Problem, np.ndarray], tuple[Problem, Fit] | None],
+) -> Outcome:
     """Add effects as long as one passes every gate.
 
     Args:
         problem: The recordings and the model with every candidate.
         start: Initial states to start from, [S, nq + nv].
         say: Told what is being done.
+        cut_longer: Cuts again for parameters with which the model can be followed for longer; see
+            `horizon.cut_longer`. A small effect that a large one hid may show only there.
     """
     before = settle(problem, problem.simulator.base, start)
     metric = make_metric(problem)
-    floor = noise_floor(problem, metric, before)
-    adequate = not is_above(problem, metric, before, floor)
-    current, steps, first_round, best, added = before, [], (), None, None
+    adequate = not is_above(problem, metric, before, noise_floor(problem, metric, before))
+    found = _select(problem, before, [], say)
+    candidates = found.candidates
+    while found.steps and (longer := cut_longer(found.problem, found.fit.theta)):
+        again = _go_on(found, *longer, say)
+        if again is None:
+            break
+        found = again
+        before = settle(found.problem, found.problem.simulator.base, longer[1].start)
+    problem, steps, current = found.problem, found.steps, found.fit
+    if steps:
+        current = found.timeless or count_timestep(problem, current)
+        steps[-1] = steps[-1]._replace(fit=current)
+    selected = tuple(_refreshed(problem, step, current) for step in steps)
+    best = current if steps else found.best
+    if not is_above(problem, make_metric(problem), current, found.floor):
+        best = None
+    return Outcome(
+        problem,
+        before,
+        current,
+        _without_superfluous(candidates, selected),
+        tuple(steps),
+        selected,
+        found.floor.error,
+        adequate,
+        best,
+    )
+
+
+def _go_on(found: Selection, longer: Problem, settled: Fit, say) -> Selection | None:
+    """Go on with longer segments; return None if nothing more is found there."""
+    longer = trusted(longer, settled)
+    say(f"following the recordings for {longer.horizon:.2g} s at a time")
+    current = fit(longer, found.fit.theta, settled.start, found.fit.free)
+    again = _select(longer, current, found.steps, say)
+    if {step.effect for step in again.steps} <= {step.effect for step in found.steps}:
+        return None
+    return again._replace(steps=refitted(longer, again.steps, again.fit))
+
+
+def _select(problem: Problem, current: Fit, steps: Sequence[Step], say) -> Selection:
+    """Add effects to those of some steps, which a fit has already, until none passes every gate."""
+    metric, floor = make_metric(problem), noise_floor(problem, make_metric(problem), current)
+    steps, first_round, best, timeless = list(steps), (), None, None
     for number in range(ROUNDS):
-        gap = is_above(problem, metric, current, floor)
-        if number and not gap:
+        if steps and not is_above(problem, metric, current, floor):
             break
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}")
@@ -140,21 +193,13 @@ def explain(problem: Problem, start: np.ndarray, say: Callable[[str], None]) -> 
         added = _completed(problem, [step.contender for step in chosen], say)
         current = added.fit
         steps[-1] = steps[-1]._replace(fit=current)
-        steps, current = _prune(problem, steps, current, steps[:-1], say)
+        steps, current = prune(problem, steps, current, steps[:-1], say)
         floor = noise_floor(problem, metric, current)
         if is_above(problem, metric, current, floor, REFINED_ABOVE):
             steps, current = swap(problem, steps, current, say)
             floor = noise_floor(problem, metric, current)
-    if added is not None:
-        known = added.timeless if current is added.fit else None
-        current = known or count_timestep(problem, current)
-        steps[-1] = steps[-1]._replace(fit=current)
-    selected = tuple(_refreshed(problem, step, current) for step in steps)
-    candidates = _without_superfluous(first_round, selected)
-    best = current if steps else best
-    if not is_above(problem, metric, current, floor):
-        best = None
-    return Outcome(before, current, candidates, tuple(steps), selected, floor.error, adequate, best)
+        timeless = added.timeless if current is added.fit else None
+    return Selection(problem, steps, current, timeless, floor, first_round, best)
 
 
 def _round(problem: Problem, metric: Metric, current: Fit, held, floor: Floor, say) -> Judged:
@@ -243,96 +288,6 @@ def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Fl
                 others = (c for c in contenders if c.score.effect not in replaced)
                 contenders, best = [contender, *others], contender
     return contenders
-
-
-def _prune(problem: Problem, steps: list[Step], current: Fit, tried: list[Step], say):
-    """Drop those effects that became superfluous: without them the cost stays as it is."""
-    kept = steps
-    for step in tried:
-        others = [s.effect for s in kept if s.effect != step.effect]
-        if not others:
-            break
-        say(f"trying without {step.candidate.named}")
-        without = _fit_only(problem, current, others, current.cost[problem.fitted].sum())
-        if not leads(problem, current, without):
-            kept = [other for other in kept if other.effect != step.effect]
-            current = without
-    return (steps if len(kept) == len(steps) else _refitted(problem, kept, current)), current
-
-
-def _refitted(problem: Problem, steps: list[Step], current: Fit) -> list[Step]:
-    """Return steps with the fits that now lead to the current one."""
-    effects = [step.effect for step in steps]
-    fits = [_fit_only(problem, current, effects[:n]) for n in range(1, len(steps))]
-    return [step._replace(fit=f) for step, f in zip(steps, (*fits, current), strict=True)]
-
-
-def swap(problem: Problem, steps: list[Step], current: Fit, say):
-    """Put effects in the place of those that they were like, where they fit better by now.
-
-    What recordings cannot tell from an effect by itself they may tell beside another, and what was
-    added since may only have made up for the wrong one.
-
-    Returns:
-        The steps and the fit with all of them.
-    """
-    found, fitted = steps, current
-    for place, step in enumerate(steps[:-1]):
-        others = [s.effect for s in found if s.effect != step.effect]
-        better: list[tuple[Candidate, Contender]] = []
-        for candidate, contender in step.alike:
-            if contender.score.effect in others:
-                continue
-            say(f"trying {candidate.named} instead of {step.candidate.named}")
-            trial = _fit_instead(problem, fitted, others, contender)
-            if _is_better(problem, trial, fitted):
-                better.append((candidate, dataclasses.replace(contender, fit=trial)))
-        if better:
-            candidate, contender = min(better, key=lambda pair: pair[1].fit.cost.sum())
-            contender = complete(problem, contender, say)
-            rest = [pair for pair in step.alike if pair[0] is not candidate]
-            alike = [(step.candidate, step.contender), *rest]
-            instead = Step(_instead_of(step.candidate, candidate), contender, contender.fit, alike)
-            found, fitted = [*found[:place], instead, *found[place + 1 :]], contender.fit
-    if fitted is current:
-        return steps, current
-    kept, fitted = _prune(problem, found, fitted, found, say)
-    return (_refitted(problem, kept, fitted) if len(kept) == len(found) else kept), fitted
-
-
-def _is_better(problem: Problem, new: Fit, old: Fit) -> bool:
-    """Say whether a fit is certainly better than another, and no worse on what is held out."""
-    held_out = ~problem.fitted
-    return leads(problem, new, old) and new.cost[held_out].sum() <= old.cost[held_out].sum()
-
-
-def _instead_of(old: Candidate, new: Candidate) -> Candidate:
-    """Return a candidate that passes because another, which it was like, fits worse by now."""
-    alike = tuple(named for named in new.indistinguishable_from if named != old.named)
-    why = f"fits better than {old.named} beside what was found since"
-    return dataclasses.replace(new, indistinguishable_from=alike, passes=True, why=why)
-
-
-def _fit_instead(problem: Problem, current: Fit, others: Sequence[int], instead: Contender) -> Fit:
-    """Fit again with the effects `others` and with what was fitted `instead` of the rest."""
-    columns, rival = list(instead.score.columns), current.cost[problem.fitted].sum()
-    theta, free = _only(problem, current, others)
-    theta[columns] = instead.fit.theta[columns]
-    free += columns
-    return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
-
-
-def _fit_only(problem: Problem, current: Fit, effects: Sequence[int], rival=np.inf) -> Fit:
-    """Fit again with some of the selected effects, the others back at no effect."""
-    theta, free = _only(problem, current, effects)
-    return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
-
-
-def _only(problem: Problem, current: Fit, effects: Sequence[int]) -> tuple[np.ndarray, list[int]]:
-    """Return parameters at which only some effects act, and which of theirs are fitted."""
-    present = np.asarray([slot.effect in effects for slot in problem.simulator.slots])
-    theta = np.where(present, current.theta, problem.simulator.base)
-    return theta, [j for j in current.free if present[j]]
 
 
 def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:

@@ -5,14 +5,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import stats
 
-from garat_jax.diagnosis.diagnose import choose_horizon, split, thin
-from garat_jax.diagnosis.fit import count_timestep, fit, settle
+from garat_jax.diagnosis.diagnose import split, thin
+from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, make_effect
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Candidate, Repeated, Sighting
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
 from garat_jax.effects import Effect
 
 SIGNIFICANCE = 0.01
@@ -61,24 +63,25 @@ def repeatability(
     grid = choose_grid(everything, model.compile(engine="mujoco").host.model.opt.timestep)
     effects = nominal_effects(model, selected)
     simulator = Simulator(model, effects, grid)
-    _, segments = choose_horizon(simulator, everything, grid)
     finer = Simulator(model, effects, grid, refine=2)
+    theta = found_theta(simulator, selected)
+    _, segments = choose_horizon(simulator, everything, grid)
     sample = grid.interval * grid.per_sample
     everywhere = np.ones(len(segments.start), bool)
     whole = Problem(simulator, finer, segments, everywhere, sample)
-    theta = found_theta(simulator, selected)
     free = [
         j
         for j, slot in enumerate(simulator.slots)
         if np.isfinite(_half_width(selected[slot.effect], slot.parameter.name))
     ]
-    start = settle(whole, theta, segments.start).start
+    longer = cut_longer(whole, everything, grid, theta)
+    whole, settled = longer or (whole, settle(whole, theta, segments.start))
     sightings: dict[int, list[Sighting]] = {j: [] for j in free}
     for index, recording in enumerate(everything):
         say(f"fitting {recording.name} alone")
-        own = segments.recording == index
+        own = whole.segments.recording == index
         alone = whole.take(own)
-        found = count_timestep(alone, fit(alone, theta, start[own], free))
+        found = count_timestep(alone, fit(alone, theta, settled.start[own], free))
         for place, j in enumerate(free):
             seen = j not in found.frozen
             numbers = (found.theta[j], found.low[place], found.high[place])

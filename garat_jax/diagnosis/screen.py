@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from garat_jax.diagnosis.evidence import Evidence
-from garat_jax.diagnosis.fit import Fit
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.robust import orthonormal, without
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import Fit
 from garat_jax.diagnosis.trials import Row, Trial, best_sizes, enlarge, firsts, others
 
 EQUIVALENT = 0.95

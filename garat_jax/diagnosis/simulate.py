@@ -143,7 +143,7 @@ class Simulator:
         """Predict every segment's signals.
 
         Args:
-            theta: Parameters, [P, num_parameters].
+            theta: Parameters, [P, num_parameters] or, each segment its own, [P, S, ..].
             start: Initial states, [P, S, nq + nv].
             segments: Commands and sample times.
 
@@ -208,8 +208,9 @@ class Simulator:
         return ways
 
     def _acting(self, thetas: np.ndarray) -> tuple[int, ...]:
-        """Return the effects that act under some row of parameters [P, num_parameters]."""
-        moved = self._owner[np.any(thetas != self.base, axis=0)].tolist()
+        """Return the effects that act under some row of parameters [.., num_parameters]."""
+        rows = tuple(range(thetas.ndim - 1))
+        moved = self._owner[np.any(thetas != self.base, axis=rows)].tolist()
         return tuple(sorted({*moved, *self._always}))
 
     def _is_at_once(self, theta: np.ndarray) -> bool:
@@ -235,7 +236,8 @@ class Simulator:
     def _in_batches(self, program: Program, segments: Segments, theta, start, path=None):
         """Run a program for rows [P] and segments [S]; return signals and paths [P, S, ..].
 
-        Rows and segments together are cut into batches of a size that is compiled once.
+        Parameters are a row's, or each segment's own. Rows and segments together are cut into
+        batches of a size that is compiled once.
         """
         num_rows, num_segments = start.shape[:2]
         total = num_rows * num_segments
@@ -248,7 +250,8 @@ class Simulator:
             more = () if path is None else (path[segment],)
             begin = starts[chosen]
             begin[total - first :] = np.nan  # padding: C MuJoCo leaves it out
-            inputs = (theta[row], begin, segments.ctrl[segment], segments.place[segment])
+            own = theta[row, segment] if theta.ndim > 2 else theta[row]
+            inputs = (own, begin, segments.ctrl[segment], segments.place[segment])
             with jax.enable_x64(True):
                 signals, true = program.run(*inputs, *more)
                 found.append(np.asarray(signals)[..., : segments.measured.shape[2]])

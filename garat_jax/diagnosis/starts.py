@@ -1,5 +1,7 @@
 """Initial states of segments at fixed parameters, by damped Gauss-Newton steps of their own."""
 
+import dataclasses
+
 import numpy as np
 
 from garat_jax.diagnosis.problem import LARGE, Linearisation, Problem, linearise
@@ -19,6 +21,79 @@ POOR = 1.3
 SMOOTH = 0.3
 """How far the change of the residual towards another initial state is from that which sensitivities
 promise, relative to it, below which both lead to the same settled state."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """Parameters, initial states and what is left of the residual.
+
+    Attributes:
+        theta: All parameters, [num_parameters].
+        free: Indices of those that were fitted.
+        frozen: Indices that the data do not excite; they kept their values.
+        start: Initial states, [S, nq + nv].
+        residual: Whitened, [S, N].
+        sensitivity: Its derivatives by the initial states, [S, N, nq + nv].
+        low: Lower ends of the free parameters' 95 % intervals, at the model's own timestep; see
+            `count_timestep`.
+        high: Upper ends.
+    """
+
+    theta: np.ndarray
+    free: tuple[int, ...]
+    frozen: tuple[int, ...]
+    start: np.ndarray
+    residual: np.ndarray
+    sensitivity: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def take(self, chosen: np.ndarray) -> "Fit":
+        """Return the fit of some of the segments."""
+        parts = {name: getattr(self, name)[chosen] for name in ("start", "residual", "sensitivity")}
+        return dataclasses.replace(self, **parts)
+
+    @property
+    def cost(self) -> np.ndarray:
+        """Sum of squares of each segment, [S]."""
+        return np.sum(self.residual**2, axis=1)
+
+
+def settle(problem: Problem, theta: np.ndarray, start: np.ndarray, iterations: int = 8) -> Fit:
+    """Estimate the initial state of every segment at fixed parameters.
+
+    Each segment has a damping of its own and is done when its linearisation promises no fall of
+    its cost that matters; a step that was rejected is tried again, shorter.
+    """
+    lin = linearise(problem, theta, start, (), ())
+    start, lin = settle_starts(problem, theta, start, lin, iterations)
+    start, lin = settle_anew(problem, theta, start, lin)
+    nothing = np.zeros(0)
+    return Fit(theta, (), (), start, lin.residual, lin.start, nothing, nothing)
+
+
+def follow(problem: Problem, theta, near: Fit) -> Fit:
+    """Settle the initial states at parameters near those of a fit, with its sensitivities."""
+    lin = linearise(problem, theta, near.start, (), (), near.sensitivity)
+    start, lin = settle_starts(problem, theta, near.start, lin, SETTLE_STEPS)
+    return dataclasses.replace(
+        near, theta=theta, start=start, residual=lin.residual, sensitivity=lin.start
+    )
+
+
+def follow_each(problem: Problem, thetas: np.ndarray, near: Fit) -> list[Fit]:
+    """Settle the initial states at each of many parameters [K, num_parameters], all in one batch.
+
+    A call of C MuJoCo costs more than a few segments' step in it.
+    """
+    num = len(near.start)
+    every = np.tile(np.arange(num), len(thetas))
+    found = follow(problem.take(every), np.repeat(thetas, num, axis=0), near.take(every))
+    parts = np.split(np.arange(len(every)), len(thetas))
+    return [
+        dataclasses.replace(found.take(part), theta=theta)
+        for theta, part in zip(thetas, parts, strict=True)
+    ]
 
 
 def settle_anew(problem: Problem, theta, start: np.ndarray, lin: Linearisation):
@@ -77,7 +152,10 @@ def _carried(problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.nd
 
 
 def settle_starts(problem: Problem, theta, start, lin: Linearisation, iterations: int):
-    """Return settled initial states and the linearisation at them, from one that is near."""
+    """Return settled initial states and the linearisation at them, from one that is near.
+
+    Parameters are [num_parameters], or each segment's, [S, num_parameters].
+    """
     lin = lin._replace(parameters=lin.parameters[..., :0])
     damping, is_stale = np.full(len(start), 1e-6), np.ones(len(start), bool)
     for _ in range(iterations):
@@ -97,7 +175,8 @@ def settle_starts(problem: Problem, theta, start, lin: Linearisation, iterations
         damping = np.where(better, damping * 0.1, later)
         again = open_still & (is_stale | better) & (fall < KEPT_PROMISE * promised)
         if np.any(again):
-            fresh = linearise(problem.take(again), theta, start[again], (), ())
+            own = theta[again] if np.ndim(theta) > 1 else theta
+            fresh = linearise(problem.take(again), own, start[again], (), ())
             lin.start[again] = fresh.start
         is_stale = np.where(again, False, is_stale | better)
     return start, lin

@@ -3,22 +3,17 @@
 Data come from C MuJoCo at a 32nd of the model's timestep. Thresholds were chosen on seeds 0 to 9.
 """
 
-import dataclasses
 import json
 from pathlib import Path
 
-import mujoco
-import numpy as np
 import pytest
 
-from garat_jax.diagnosis import Model, Recording, diagnose, load_model
+from garat_jax.diagnosis import Recording, diagnose, load_model
 from garat_jax.diagnosis.convert import free_pendulum
-from garat_jax.diagnosis.diagnose import choose_horizon, is_explained
+from garat_jax.diagnosis.diagnose import is_explained
 from garat_jax.diagnosis.hidden import DRAWN, OUTSIDE, make_recordings
 from garat_jax.diagnosis.results import Errors
-from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.separate import next_experiment
-from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.runs import RunDirectory
 
 PENDULUM = Path(__file__).parents[2] / "envs" / "assets" / "pendulum.xml"
@@ -83,52 +78,6 @@ def test_a_gap_is_explained_if_little_is_left_and_that_near_the_floor(
     after, floor, share, explained
 ):
     assert is_explained(Errors("", "1", 1.0, after, floor, share, {})) is explained
-
-
-SLIDER = """
-<mujoco>
-  <option timestep="0.002" integrator="implicitfast"/>
-  <worldbody>
-    <geom type="plane" size="5 5 0.1" friction="0.15 0.005 0.0001"/>
-    <body pos="0 0 0.02">
-      <joint name="along" type="slide" axis="1 0 0" damping="0.3"/>
-      <joint name="height" type="slide" axis="0 0 1"/>
-      <geom type="box" size="0.06 0.06 0.02" mass="0.5" friction="0.15 0.005 0.0001"/>
-    </body>
-  </worldbody>
-  <actuator><motor joint="along" ctrlrange="-4 4"/></actuator>
-</mujoco>
-"""
-
-
-def test_a_height_that_hardly_moves_does_not_shorten_segments():
-    spec = mujoco.MjSpec.from_string(SLIDER)
-    rng, time = np.random.default_rng(0), np.arange(1000) * 0.004
-    model = spec.compile()
-    data, states = mujoco.MjData(model), []
-    ctrl = 2.0 * np.sin(4.0 * time) + 0.5 * np.sin(11.0 * time)
-    for command in ctrl:
-        states.append([*data.qpos, *data.qvel])
-        data.ctrl[0] = command
-        mujoco.mj_step(model, data, 2)
-    noisy = np.asarray(states) + rng.normal(size=(1000, 4)) * [3e-4, 3e-4, 6e-3, 6e-3]
-    spans = ((0, len(time)),)
-    recording = Recording(
-        "slid", time, noisy[:, :2], noisy[:, 2:], ctrl[:, None], {}, True, spans, ()
-    )
-    grid = choose_grid([recording], 0.002)
-    simulator = Simulator(Model("slider", __file__, __file__, spec), (), grid)
-    horizon, segments = choose_horizon(simulator, [recording], grid)
-    assert horizon >= 1.0
-    assert segments.measured.shape[1] == round(horizon / 0.004)
-    hopping = 0.05 * np.abs(np.sin(3.0 * time))
-    heights = np.stack([hopping, np.gradient(hopping, time)], axis=1)
-    lifted = dataclasses.replace(
-        recording,
-        qpos=noisy[:, :2] + [0, 1] * heights[:, :1],
-        qvel=noisy[:, 2:] + [0, 1] * heights[:, 1:],
-    )
-    assert choose_horizon(simulator, [lifted], grid)[0] == 0.2
 
 
 @pytest.mark.slow

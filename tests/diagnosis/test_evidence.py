@@ -7,10 +7,11 @@ import pytest
 
 from garat_jax.diagnosis.contend import Contender, with_evidence
 from garat_jax.diagnosis.evidence import Evidence
-from garat_jax.diagnosis.fit import fit, settle
+from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.robust import wald_test
 from garat_jax.diagnosis.screen import Score
+from garat_jax.diagnosis.starts import settle
 from garat_jax.effects import ActuatorDelay, ViscousDamping
 from tests.diagnosis.test_fit import make_problem, record
 

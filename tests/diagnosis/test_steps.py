@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis.contend import Contender
-from garat_jax.diagnosis.diagnose import choose_horizon
-from garat_jax.diagnosis.fit import fit, settle
+from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.horizon import choose_horizon
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import Step, swap
 from garat_jax.diagnosis.results import Candidate, Interval, Named
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.steps import Step, swap
 from garat_jax.effects import MotorGain, QuadraticDrag, TorqueOffset, ViscousDamping
 from tests.diagnosis.pendulum import MODEL, add_damping, record
 

@@ -1,0 +1,114 @@
+"""How long a segment may last: as long as the model can be followed."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.problem import AnyProblem, Predictor
+from garat_jax.diagnosis.segments import Grid, Segments, cut
+from garat_jax.diagnosis.starts import Fit, settle
+
+HORIZONS = (2.0, 1.0, 0.5, 0.3, 0.2)
+"""Seconds that a segment may last, longest first."""
+PERTURBATIONS = (1e-5, 1e-2)
+"""Changes of the initial states whose growth is measured, relative to their spread; the smaller one
+counts. Contacts that chatter at the model's timestep make jumps of one size, much beside a small
+change, which seldom makes any, and little beside a large one."""
+LARGEST_GROWTH = 4.0
+"""Growth of a small perturbation within a segment; above it sensitivities cease to be linear."""
+LARGEST_ERROR = 0.2
+"""Error within a segment, relative to the signal's spread, for the same reason."""
+BEYOND = 4.0
+"""Standard deviations of its noise that the error of a signal may reach by noise alone."""
+MOST = 0.9
+"""Share of the segments that must keep below both."""
+
+
+def choose_horizon(
+    simulator: Predictor, recordings: Sequence[Recording], grid: Grid
+) -> tuple[float, Segments]:
+    """Choose the longest horizon over which fits are nearly linear, and cut there.
+
+    Growth is the change of the signals after a small change of the initial state, both relative to
+    the signals' spread; the error is that of the model from the measured initial state, less what
+    noise makes of it, in signals that spread beyond `QUIET` times their noise, if there are any.
+    """
+    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
+    horizons = [h for h in HORIZONS if h <= max(longest, HORIZONS[-1])]
+    segments = cut(recordings, grid, horizons[0])
+    sample = grid.interval * grid.per_sample
+    predicted = _perturbed(simulator, simulator.base, segments)
+    limits = np.stack([_growth(predicted, segments), _error(predicted[0], segments)])
+    horizon = horizons[-1]
+    for horizon in horizons:
+        within = limits[:, :, : max(2, round(horizon / sample))].max(axis=2)
+        if all(_is_within(sizes) for sizes in within):
+            break
+    return horizon, segments if horizon == horizons[0] else cut(recordings, grid, horizon)
+
+
+def cut_longer(
+    problem: AnyProblem, recordings: Sequence[Recording], grid: Grid, theta: np.ndarray
+) -> tuple[AnyProblem, Fit] | None:
+    """Cut into the longest segments over which a model with some parameters can be followed.
+
+    As `choose_horizon`, but the error is that from initial states that are fitted: those measured
+    are noisy, and a better model has a smaller error than their noise makes.
+
+    Args:
+        problem: The recordings, cut into shorter segments.
+        recordings: What was measured.
+        grid: The simulated steps.
+        theta: The parameters, [num_parameters].
+
+    Returns:
+        The problem of longer segments and a fit of their initial states, or None.
+    """
+    fitted = np.unique(problem.segments.recording[problem.fitted])
+    for horizon in HORIZONS:
+        segments = cut(recordings, grid, horizon)
+        if segments.measured.shape[1] <= problem.segments.measured.shape[1]:
+            break
+        growth = _growth(_perturbed(problem.simulator, theta, segments), segments)
+        if _is_within(growth.max(axis=1)):
+            seen = np.isin(segments.recording, fitted)
+            longer = dataclasses.replace(problem, segments=segments, fitted=seen)
+            settled = settle(longer, theta, segments.start)
+            if _is_within(_error(longer.unwhiten(settled.residual), segments).max(axis=1)):
+                return longer, settled
+    return None
+
+
+def _is_within(sizes: np.ndarray) -> bool:
+    """Say whether growth or error of enough segments [S] stay below their limits."""
+    return bool(np.quantile(sizes, MOST, method="higher") <= 1.0)
+
+
+def _perturbed(simulator: Predictor, theta: np.ndarray, segments: Segments) -> np.ndarray:
+    """Predict from the measured initial states, and from those moved by each of `PERTURBATIONS`."""
+    unit = np.diag(segments.start_unit)
+    steps = [np.zeros((1, len(unit))), *(size * unit for size in PERTURBATIONS)]
+    starts = segments.start + np.concatenate(steps)[:, None]
+    return simulator.predict(np.tile(theta, (len(starts), 1)), starts, segments)
+
+
+def _growth(predicted: np.ndarray, segments: Segments) -> np.ndarray:
+    """Return the largest of any signal by `LARGEST_GROWTH`, [S, L]; see `_perturbed`."""
+    change = np.abs(predicted[1:] - predicted[0]) / segments.spread
+    by_size = zip(np.split(change, len(PERTURBATIONS)), PERTURBATIONS, strict=True)
+    growth = np.min([_or_inf(part.max(axis=(0, 3)) / size) for part, size in by_size], axis=0)
+    return growth / LARGEST_GROWTH
+
+
+def _error(predicted: np.ndarray, segments: Segments) -> np.ndarray:
+    """Return the largest of any signal by `LARGEST_ERROR`, [S, L]."""
+    seen = segments.moves if np.any(segments.moves) else np.ones_like(segments.moves)
+    error = np.maximum(np.abs(predicted - segments.measured) - BEYOND * segments.noise, 0.0)
+    error = (error * segments.weight[..., None] / segments.spread)[..., seen].max(axis=2)
+    return _or_inf(error) / LARGEST_ERROR
+
+
+def _or_inf(sizes: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(sizes), sizes, np.inf)

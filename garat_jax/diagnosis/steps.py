@@ -1,0 +1,125 @@
+"""The effects added so far: what became superfluous goes, what fits better takes its place."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from garat_jax.diagnosis.contend import Contender, complete
+from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.judge import leads
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.results import Candidate
+from garat_jax.diagnosis.starts import Fit
+
+
+class Step(NamedTuple):
+    """One effect that was added.
+
+    Attributes:
+        candidate: What was said of it.
+        contender: How it was fitted then.
+        fit: The fit with it and those before it.
+        alike: What the recordings could not tell from it then.
+    """
+
+    candidate: Candidate
+    contender: Contender
+    fit: Fit
+    alike: Sequence[tuple[Candidate, Contender]]
+
+    @property
+    def effect(self) -> int:
+        """Its index among the simulator's."""
+        return self.contender.score.effect
+
+
+def prune(problem: Problem, steps: list[Step], current: Fit, tried: list[Step], say):
+    """Drop those effects that became superfluous: without them the cost stays as it is."""
+    kept = steps
+    for step in tried:
+        others = [s.effect for s in kept if s.effect != step.effect]
+        if not others:
+            break
+        say(f"trying without {step.candidate.named}")
+        without = _fit_only(problem, current, others, current.cost[problem.fitted].sum())
+        if not leads(problem, current, without):
+            kept = [other for other in kept if other.effect != step.effect]
+            current = without
+    return (steps if len(kept) == len(steps) else refitted(problem, kept, current)), current
+
+
+def refitted(problem: Problem, steps: list[Step], current: Fit) -> list[Step]:
+    """Return steps with the fits that now lead to the current one."""
+    effects = [step.effect for step in steps]
+    fits = [_fit_only(problem, current, effects[:n]) for n in range(1, len(steps))]
+    return [step._replace(fit=f) for step, f in zip(steps, (*fits, current), strict=True)]
+
+
+def swap(problem: Problem, steps: list[Step], current: Fit, say):
+    """Put effects in the place of those that they were like, where they fit better by now.
+
+    What recordings cannot tell from an effect by itself they may tell beside another, and what was
+    added since may only have made up for the wrong one.
+
+    Returns:
+        The steps and the fit with all of them.
+    """
+    found, fitted = steps, current
+    for place, step in enumerate(steps[:-1]):
+        others = [s.effect for s in found if s.effect != step.effect]
+        better: list[tuple[Candidate, Contender]] = []
+        for candidate, contender in step.alike:
+            if contender.score.effect in others:
+                continue
+            say(f"trying {candidate.named} instead of {step.candidate.named}")
+            trial = _fit_instead(problem, fitted, others, contender)
+            if _is_better(problem, trial, fitted):
+                better.append((candidate, dataclasses.replace(contender, fit=trial)))
+        if better:
+            candidate, contender = min(better, key=lambda pair: pair[1].fit.cost.sum())
+            contender = complete(problem, contender, say)
+            rest = [pair for pair in step.alike if pair[0] is not candidate]
+            alike = [(step.candidate, step.contender), *rest]
+            instead = Step(_instead_of(step.candidate, candidate), contender, contender.fit, alike)
+            found, fitted = [*found[:place], instead, *found[place + 1 :]], contender.fit
+    if fitted is current:
+        return steps, current
+    kept, fitted = prune(problem, found, fitted, found, say)
+    return (refitted(problem, kept, fitted) if len(kept) == len(found) else kept), fitted
+
+
+def _is_better(problem: Problem, new: Fit, old: Fit) -> bool:
+    """Say whether a fit is certainly better than another, and no worse on what is held out."""
+    held_out = ~problem.fitted
+    return leads(problem, new, old) and new.cost[held_out].sum() <= old.cost[held_out].sum()
+
+
+def _instead_of(old: Candidate, new: Candidate) -> Candidate:
+    """Return a candidate that passes because another, which it was like, fits worse by now."""
+    alike = tuple(named for named in new.indistinguishable_from if named != old.named)
+    why = f"fits better than {old.named} beside what was found since"
+    return dataclasses.replace(new, indistinguishable_from=alike, passes=True, why=why)
+
+
+def _fit_instead(problem: Problem, current: Fit, others: Sequence[int], instead: Contender) -> Fit:
+    """Fit again with the effects `others` and with what was fitted `instead` of the rest."""
+    columns, rival = list(instead.score.columns), current.cost[problem.fitted].sum()
+    theta, free = _only(problem, current, others)
+    theta[columns] = instead.fit.theta[columns]
+    free += columns
+    return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
+
+
+def _fit_only(problem: Problem, current: Fit, effects: Sequence[int], rival=np.inf) -> Fit:
+    """Fit again with some of the selected effects, the others back at no effect."""
+    theta, free = _only(problem, current, effects)
+    return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
+
+
+def _only(problem: Problem, current: Fit, effects: Sequence[int]) -> tuple[np.ndarray, list[int]]:
+    """Return parameters at which only some effects act, and which of theirs are fitted."""
+    present = np.asarray([slot.effect in effects for slot in problem.simulator.slots])
+    theta = np.where(present, current.theta, problem.simulator.base)
+    return theta, [j for j in current.free if present[j]]

@@ -1,0 +1,102 @@
+"""Segments are as long as a model can be followed, and longer with what was found."""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.diagnose import diagnose
+from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
+from garat_jax.effects import CATALOGUE, MotorGain
+from tests.diagnosis.pendulum import MODEL, record
+
+GAIN, PULL = 0.5, 0.008  # N m
+
+
+def weaken(spec: mujoco.MjSpec) -> None:
+    (motor,) = spec.actuators
+    motor.gear = np.asarray(motor.gear) * GAIN
+
+
+def record_weak(pull: float) -> list[Recording]:
+    return [record(weaken, seed, pull=pull) for seed in range(4)]
+
+
+def test_what_was_found_lets_a_model_be_followed_for_longer():
+    recordings = record_weak(0.0)
+    grid = choose_grid(recordings, 0.002)
+    simulator = Simulator(MODEL, (MotorGain("actuator/motor"),), grid)
+    horizon, segments = choose_horizon(simulator, recordings, grid)
+    problem = Problem(simulator, simulator, segments, segments.recording < 3, 0.004)
+    assert problem.horizon == pytest.approx(horizon)
+    assert cut_longer(problem, recordings, grid, simulator.base) is None
+    found = cut_longer(problem, recordings, grid, np.asarray([GAIN]))
+    assert found
+    longer, settled = found
+    assert longer.horizon > horizon
+    assert np.array_equal(longer.fitted, longer.segments.recording < 3)
+    without = settle(longer, simulator.base, settled.start)
+    assert settled.cost.sum() < 0.1 * without.cost.sum()
+    assert cut_longer(longer, recordings, grid, np.asarray([GAIN])) is None
+
+
+def test_a_small_effect_is_found_that_a_large_one_hid():
+    kinds = ("motor_gain", "torque_offset", "viscous_damping", "coulomb_friction")
+    model = dataclasses.replace(MODEL, catalogue={kind: CATALOGUE[kind] for kind in kinds})
+    gain, offset = diagnose(model, record_weak(PULL)).selected
+    assert (gain.effect, offset.effect) == ("motor_gain", "torque_offset")
+    assert gain.parameters["scale"].estimate == pytest.approx(GAIN, rel=0.01)
+    assert offset.parameters["torque"].estimate == pytest.approx(PULL, rel=0.05)
+
+
+SLIDER = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <geom type="plane" size="5 5 0.1" friction="0.15 0.005 0.0001"/>
+    <body pos="0 0 0.02">
+      <joint name="along" type="slide" axis="1 0 0" damping="0.3"/>
+      <joint name="height" type="slide" axis="0 0 1"/>
+      <geom type="box" size="0.06 0.06 0.02" mass="0.5" friction="0.15 0.005 0.0001"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="along" ctrlrange="-4 4"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_height_that_hardly_moves_does_not_shorten_segments():
+    spec = mujoco.MjSpec.from_string(SLIDER)
+    rng, time = np.random.default_rng(0), np.arange(1000) * 0.004
+    model = spec.compile()
+    data, states = mujoco.MjData(model), []
+    ctrl = 2.0 * np.sin(4.0 * time) + 0.5 * np.sin(11.0 * time)
+    for command in ctrl:
+        states.append([*data.qpos, *data.qvel])
+        data.ctrl[0] = command
+        mujoco.mj_step(model, data, 2)
+    noisy = np.asarray(states) + rng.normal(size=(1000, 4)) * [3e-4, 3e-4, 6e-3, 6e-3]
+    spans = ((0, len(time)),)
+    recording = Recording(
+        "slid", time, noisy[:, :2], noisy[:, 2:], ctrl[:, None], {}, True, spans, ()
+    )
+    grid = choose_grid([recording], 0.002)
+    simulator = Simulator(Model("slider", __file__, __file__, spec), (), grid)
+    horizon, segments = choose_horizon(simulator, [recording], grid)
+    assert horizon >= 1.0
+    assert segments.measured.shape[1] == round(horizon / 0.004)
+    hopping = 0.05 * np.abs(np.sin(3.0 * time))
+    heights = np.stack([hopping, np.gradient(hopping, time)], axis=1)
+    lifted = dataclasses.replace(
+        recording,
+        qpos=noisy[:, :2] + [0, 1] * heights[:, :1],
+        qvel=noisy[:, 2:] + [0, 1] * heights[:, 1:],
+    )
+    assert choose_horizon(simulator, [lifted], grid)[0] == 0.2
