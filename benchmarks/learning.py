@@ -172,10 +172,16 @@ def target_steps(arguments: Arguments, name: str) -> int:
 
 
 def recorded(arguments: Arguments) -> tuple[Kept, Kept]:
-    """Return the rows of the result file, of worlds and of targets, of as many seeds and steps."""
-    text = (arguments.out / f"{NAME}.json").read_text(encoding="utf-8")
-    result, seeds = json.loads(text), arguments.seeds
-    worlds = [row for row in result["rows"] if _size(row) == (seeds, arguments.steps)]
+    """Return the rows of the result file, of worlds and of targets; not where `TIMES` changed.
+
+    Raises:
+        SystemExit: They have another number of seeds or steps.
+    """
+    path = arguments.out / f"{NAME}.json"
+    result, seeds = json.loads(path.read_text(encoding="utf-8")), arguments.seeds
+    worlds, sizes = result["rows"], {_size(row) for row in result["rows"]}
+    if sizes - {(seeds, arguments.steps)}:
+        raise SystemExit(f"--extend: {path} has (seeds, steps) {sorted(sizes)}; give the same")
     targets = [
         row
         for row in result["targets"]

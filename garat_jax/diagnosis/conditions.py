@@ -14,7 +14,7 @@ import numpy as np
 
 from garat_jax.diagnosis.diagnose import UNEXPLAINED, diagnose, split, thin
 from garat_jax.diagnosis.fit import count_timestep, fit
-from garat_jax.diagnosis.horizon import choose_horizon
+from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
@@ -163,13 +163,16 @@ def _fit_together(
     _, segments = choose_horizon(joint, everything, grid)
     fitted = np.ones(len(segments.start), bool)
     problem = Problem(joint, finer, segments, fitted, grid.interval * grid.per_sample)
+    start = segments.start
+    if longer := cut_longer(problem, everything, grid, joint.base):
+        problem, start = longer[0], longer[1].start
     candidates = [c for d in diagnoses for c in d.selected]
     free = [
         j
         for j, slot in enumerate(joint.slots)
         if _is_fitted(candidates[slot.effect], slot.parameter.name)
     ]
-    best = count_timestep(problem, fit(problem, joint.base, segments.start, free))
+    best = count_timestep(problem, fit(problem, joint.base, start, free))
     refined = iter(
         dataclasses.replace(c, parameters=estimates(problem, number, best))
         for number, c in enumerate(candidates)

@@ -70,7 +70,7 @@ def diagnose(
     problem = trusted(problem, settled)
     outcome = explain(problem, settled.start, say, lambda p, t: cut_longer(p, everything, grid, t))
     problem = outcome.problem
-    error = _errors(problem, outcome, host, f"{how}, segments of {problem.horizon:.2g} s")
+    error = _errors(problem, outcome, host, how)
     return Diagnosis(
         model=str(model.path),
         data=tuple(r.name for r in fitted),
@@ -139,6 +139,14 @@ def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
     return tuple(candidates)
 
 
+def metric_in_words(problem: Problem, how: str) -> str:
+    """Say what the reported errors are; `how` names the recordings."""
+    return (
+        f"root mean square of prediction error by signal's standard deviation, {QUIET:g} times its "
+        f"noise at least, {how}, segments of {problem.horizon:.2g} s"
+    )
+
+
 def _verdict(outcome: Outcome, error: Errors) -> Verdict:
     if outcome.adequate:
         return "adequate"
@@ -178,8 +186,7 @@ def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str) 
             "unit": listed[i].unit,
         }
     return Errors(
-        metric=f"root mean square of prediction error by signal's standard deviation, "
-        f"{QUIET:g} times its noise at least, {how}",
+        metric=metric_in_words(problem, how),
         unit="1",
         before=before,
         after=after,

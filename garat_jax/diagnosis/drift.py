@@ -31,14 +31,14 @@ SMALLEST_SHARE = 0.1
 
 
 def time_in_recording(problem: Problem, recordings: Sequence[Recording]) -> np.ndarray:
-    """Return where each segment's middle lies in its recording, from -0.5 to 0.5, [S]."""
+    """Return where each residual's sample lies in its recording, from -0.5 to 0.5, [S, N]."""
     s = problem.segments
     places = []
-    for recording, first, weight in zip(s.recording, s.first, s.weight, strict=True):
+    for recording, first in zip(s.recording, s.first, strict=True):
         time = recordings[recording].time
-        middle = time[min(first + int(weight.sum()) // 2, len(time) - 1)]
-        places.append((middle - time[0]) / (time[-1] - time[0]) - 0.5)
-    return np.asarray(places)
+        samples = np.minimum(first + np.arange(s.measured.shape[1]), len(time) - 1)
+        places.append((time[samples] - time[0]) / (time[-1] - time[0]) - 0.5)
+    return np.repeat(places, s.measured.shape[2], axis=1)
 
 
 def find_drifts(
@@ -57,16 +57,16 @@ def find_drifts(
     steps = difference_steps(problem, fitted.theta, free, STEP)
     lin = linearise(problem, fitted.theta, fitted.start, free, steps)
     chosen = problem.fitted
-    when = time_in_recording(problem, recordings)[chosen, None, None]
+    when = time_in_recording(problem, recordings)[chosen, :, None]
     columns = lin.parameters[chosen]
-    residual = lin.residual[chosen, :, None]
-    rest = StartSpace(lin.start[chosen]).remove(np.concatenate([columns, residual], axis=2))
-    constant, residual = rest[..., :-1], rest[..., -1].ravel()
+    parts = [columns, columns * when, lin.residual[chosen, :, None]]
+    rest = StartSpace(lin.start[chosen]).remove(np.concatenate(parts, axis=2))
+    constant, growing, residual = np.split(rest, [len(free), 2 * len(free)], axis=2)
     labels = block_labels(problem)[chosen].ravel()
     found = []
     for place, j in enumerate(free):
-        both = np.concatenate([constant, (constant * when)[..., place : place + 1]], axis=2)
-        change, p_value, share, half = _slope(tall(both), residual, labels)
+        both = np.concatenate([constant, growing[..., place : place + 1]], axis=2)
+        change, p_value, share, half = _slope(tall(both), residual.ravel(), labels)
         if p_value * len(free) < SIGNIFICANCE and share > SMALLEST_SHARE:
             found.append((p_value, _named(problem, fitted, j, change, half, p_value, share)))
     return tuple(drift for _, drift in sorted(found, key=lambda pair: pair[0]))

@@ -46,6 +46,8 @@ ALIKE = 0.9
 """Cosine of a parameter's changes over two steps below which contacts make them, not the law."""
 WIDE = 0.5
 """Finite difference where contacts are erratic, relative to a parameter's `scale` or size."""
+WIDE_STEPS = 4
+"""Largest number of Gauss-Newton steps with these."""
 SEARCHED = 12
 """Segments with which a search is made at least, evenly chosen; each of its steps settles them."""
 SEARCHED_WITHIN = 4.0
@@ -150,7 +152,7 @@ def _wide(problem: Problem, near: Fit, free) -> Linearisation:
 
 
 def _fit_across_contacts(problem: Problem, near: Fit, free):
-    """Search if more is left than noise, and take a Gauss-Newton step with `_wide` differences.
+    """Search if more is left than noise, and take Gauss-Newton steps with `_wide` differences.
 
     Args:
         problem: What is fitted.
@@ -163,6 +165,17 @@ def _fit_across_contacts(problem: Problem, near: Fit, free):
     if _cost(problem, near) > SEARCHED_ABOVE * problem.expected[problem.fitted].sum():
         found = settle(problem, _search(problem, near, free), near.start)
         near = min((near, found), key=partial(_cost, problem))
+    stepped = _wide_step(problem, near, free)
+    for _ in range(WIDE_STEPS - 1):
+        if _cost(problem, stepped[0]) > SEARCH_ON * _cost(problem, near):
+            break
+        near = stepped[0]
+        stepped = _wide_step(problem, near, free)
+    return stepped
+
+
+def _wide_step(problem: Problem, near: Fit, free):
+    """Take a Gauss-Newton step with `_wide` differences; see `_fit_across_contacts`."""
     lin = _wide(problem, near, free)
     change, keep = _parameter_step(problem, near.theta, lin, free, 1e-4)
     theta = near.theta.copy()

@@ -7,7 +7,7 @@ import numpy as np
 
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.problem import AnyProblem, Predictor
-from garat_jax.diagnosis.segments import Grid, Segments, cut
+from garat_jax.diagnosis.segments import QUIET, Grid, Segments, cut
 from garat_jax.diagnosis.starts import Fit, settle
 
 HORIZONS = (2.0, 1.0, 0.5, 0.3, 0.2)
@@ -35,8 +35,7 @@ def choose_horizon(
     the signals' spread; the error is that of the model from the measured initial state, less what
     noise makes of it, in signals that spread beyond `QUIET` times their noise, if there are any.
     """
-    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
-    horizons = [h for h in HORIZONS if h <= max(longest, HORIZONS[-1])]
+    horizons = _possible(recordings)
     segments = cut(recordings, grid, horizons[0])
     sample = grid.interval * grid.per_sample
     predicted = _perturbed(simulator, simulator.base, segments)
@@ -67,7 +66,7 @@ def cut_longer(
         The problem of longer segments and a fit of their initial states, or None.
     """
     fitted = np.unique(problem.segments.recording[problem.fitted])
-    for horizon in HORIZONS:
+    for horizon in _possible(recordings):
         segments = cut(recordings, grid, horizon)
         if segments.measured.shape[1] <= problem.segments.measured.shape[1]:
             break
@@ -79,6 +78,12 @@ def cut_longer(
             if _is_within(_error(longer.unwhiten(settled.residual), segments).max(axis=1)):
                 return longer, settled
     return None
+
+
+def _possible(recordings: Sequence[Recording]) -> list[float]:
+    """Return the horizons that some recording lasts for, longest first; the shortest always."""
+    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
+    return [h for h in HORIZONS if h <= max(longest, HORIZONS[-1])]
 
 
 def _is_within(sizes: np.ndarray) -> bool:
@@ -104,7 +109,8 @@ def _growth(predicted: np.ndarray, segments: Segments) -> np.ndarray:
 
 def _error(predicted: np.ndarray, segments: Segments) -> np.ndarray:
     """Return the largest of any signal by `LARGEST_ERROR`, [S, L]."""
-    seen = segments.moves if np.any(segments.moves) else np.ones_like(segments.moves)
+    moves = segments.spread > QUIET * segments.noise
+    seen = moves if np.any(moves) else np.ones_like(moves)
     error = np.maximum(np.abs(predicted - segments.measured) - BEYOND * segments.noise, 0.0)
     error = (error * segments.weight[..., None] / segments.spread)[..., seen].max(axis=2)
     return _or_inf(error) / LARGEST_ERROR

@@ -9,11 +9,11 @@ import numpy as np
 
 from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.diagnose import diagnose, is_explained, split, thin
+from garat_jax.diagnosis.diagnose import diagnose, is_explained, metric_in_words, split, thin
 from garat_jax.diagnosis.export import copy_model
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.metric import make_metric
+from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, load_model, save_card
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import progress
@@ -114,12 +114,14 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     first, last = rounds[0], rounds[-1]
     if not added:
         return first
-    ladder, per_signal = _ladder(model, recordings, holdout, added)
+    ladder, per_signal, floor, metric = _ladder(model, recordings, holdout, added)
     before, after = ladder[0].error_holdout, ladder[-1].error_holdout
-    rest = float(np.sqrt(max(after**2 - first.error.noise_floor**2, 0.0)))
+    rest = float(np.sqrt(max(after**2 - floor**2, 0.0)))
     share = rest / before if before > 0 else 0.0
     error = dataclasses.replace(
         first.error,
+        metric=metric,
+        noise_floor=floor,
         before=before,
         after=after,
         unexplained_share=share,
@@ -138,27 +140,36 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
 
 
 def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
-    """Return a rung for each effect, at its final size, and each signal's error by their number."""
-    fitted, held_out, _ = split(recordings, holdout)
+    """Return what the errors of all effects together are, measured at one horizon.
+
+    Returns:
+        A rung for each effect, at its final size; each signal's error by their number; the noise
+        floor with all of them; and what the errors are, in words.
+    """
+    fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
     grid = choose_grid(everything, model.compile(engine="mujoco").host.model.opt.timestep)
-    simulator = Simulator(model, nominal_effects(model, added), grid)
+    effects = nominal_effects(model, added)
+    simulator, finer = (Simulator(model, effects, grid, refine) for refine in (1, 2))
     _, segments = choose_horizon(simulator, everything, grid)
     seen = segments.recording < len(fitted)
-    problem = Problem(simulator, simulator, segments, seen, grid.interval * grid.per_sample)
+    problem = Problem(simulator, finer, segments, seen, grid.interval * grid.per_sample)
     final = found_theta(simulator, added)
     if longer := cut_longer(problem, everything, grid, final):
         problem, _ = longer
     seen, segments, metric = problem.fitted, problem.segments, make_metric(problem)
     owners = np.asarray([slot.effect for slot in simulator.slots])
-    rungs, by_signal = [], []
-    for count in range(len(added) + 1):
-        theta = np.where(owners < count, final, simulator.base)
-        settled = settle(problem, theta, segments.start)
-        errors = metric.error(settled.residual, seen), metric.error(settled.residual, ~seen)
-        rungs.append(Rung(added[count - 1] if count else None, *errors))
-        by_signal.append(metric.by_signal(settled.residual, ~seen) * segments.noise)
-    return tuple(rungs), by_signal
+    fits = [
+        settle(problem, np.where(owners < count, final, simulator.base), segments.start)
+        for count in range(len(added) + 1)
+    ]
+    rungs = tuple(
+        Rung(candidate, metric.error(f.residual, seen), metric.error(f.residual, ~seen))
+        for candidate, f in zip((None, *added), fits, strict=True)
+    )
+    by_signal = [metric.by_signal(f.residual, ~seen) * segments.noise for f in fits]
+    floor = noise_floor(problem, metric, fits[-1]).error
+    return rungs, by_signal, floor, metric_in_words(problem, how)
 
 
 def _with_after(error: Errors, by_signal: Sequence[np.ndarray]) -> Mapping[str, Mapping[str, Any]]:

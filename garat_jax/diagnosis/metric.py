@@ -13,8 +13,6 @@ ABOVE_FLOOR = 1.5
 """A model is adequate up to this multiple of the noise floor."""
 TRUSTED = 3.0
 """Standard deviations of noise that the timestep's error may reach before a sample counts less."""
-CHATTER = 1e-3
-"""How much a signal counts that chatters at the model's timestep."""
 
 
 class Metric(NamedTuple):
@@ -58,8 +56,8 @@ def make_metric(problem: Problem) -> Metric:
     spread = np.maximum(s.measured[held_out].std(axis=0), QUIET * s.noise)
     weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
     num_signals = s.measured.shape[2]
-    counted = np.repeat(s.weight > 0, num_signals, axis=1)
-    return Metric(weight, counted, s.trust.reshape(counted.shape), spread)
+    counted, trust = (np.repeat(x, num_signals, axis=1) for x in (s.weight > 0, s.trust))
+    return Metric(weight, counted, trust, spread)
 
 
 def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
@@ -67,22 +65,17 @@ def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
 
     Where half a timestep changes a prediction by many standard deviations of noise, as after an
     impact, a residual says nothing of the model's physics. Such changes last to the end of a
-    segment. What other initial states would undo does not count. A signal that hardly moves and
-    chatters at the timestep by more than its noise, as the height of what slides on a table, counts
-    for next to nothing: every change of a parameter would show there, by chance.
+    segment. What other initial states would undo does not count.
 
     Args:
         problem: What is fitted.
-        settled: The model as it is, initial states fitted.
+        settled: The model, as it is or with what was found, initial states fitted.
     """
     segments = problem.segments
-    squares = [x.reshape(segments.measured.shape) ** 2 for x in timestep_error(problem, settled)]
-    still = ~segments.moves & np.any(segments.moves)
-    chatters = still & (squares[1][segments.weight > 0].mean(axis=0) > 1.0)
-    means = [np.mean(some[..., ~chatters], axis=2) for some in squares]
-    size = np.sqrt(np.maximum.accumulate(np.minimum(*means), axis=1))
+    shape = segments.measured.shape
+    squares = [np.mean(x.reshape(shape) ** 2, axis=2) for x in timestep_error(problem, settled)]
+    size = np.sqrt(np.maximum.accumulate(np.minimum(*squares), axis=1))
     trust = 1.0 / np.maximum(1.0, size / TRUSTED)
-    trust = trust[..., None] * np.where(chatters, CHATTER, 1.0)
     return dataclasses.replace(problem, segments=dataclasses.replace(segments, trust=trust))
 
 

@@ -175,7 +175,8 @@ def _go_on(found: Selection, longer: Problem, settled: Fit, say) -> Selection | 
 
 def _select(problem: Problem, current: Fit, steps: Sequence[Step], say) -> Selection:
     """Add effects to those of some steps, which a fit has already, until none passes every gate."""
-    metric, floor = make_metric(problem), noise_floor(problem, make_metric(problem), current)
+    metric = make_metric(problem)
+    floor = noise_floor(problem, metric, current)
     steps, first_round, best, timeless = list(steps), (), None, None
     for number in range(ROUNDS):
         if steps and not is_above(problem, metric, current, floor):

@@ -38,8 +38,7 @@ class Segments:
     Attributes:
         measured: Measured signals, [S, L, num_signals].
         weight: 1 for a sample, 0 for padding, [S, L].
-        trust: How much the residual of a sample counts, 0 to 1, [S, L, num_signals]; see
-            `metric.trusted`.
+        trust: How much the residual of a sample counts, 0 to 1, [S, L]; see `metric.trusted`.
         start: Measured initial state (qpos, qvel), [S, nq + nv].
         ctrl: Command of every simulated step, the warm-up's first, [S, warm_up + steps, nu].
         place: Where a sample lies between simulated steps, [S, L].
@@ -61,11 +60,6 @@ class Segments:
     noise: np.ndarray
     spread: np.ndarray
     start_unit: np.ndarray
-
-    @property
-    def moves(self) -> np.ndarray:
-        """Which signals spread beyond `QUIET` times their noise, [num_signals]."""
-        return self.spread > QUIET * self.noise
 
     def take(self, chosen: np.ndarray) -> "Segments":
         """Return some of the segments; noise, spread and units stay those of all."""
@@ -150,7 +144,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     return Segments(
         measured=measured,
         weight=weight,
-        trust=np.ones_like(measured),
+        trust=np.ones_like(weight),
         start=start,
         ctrl=ctrl,
         place=place,

@@ -16,6 +16,8 @@ HELD = 30.0
 """Measurements that hold a component of an initial state where it is, in each step of settling: one
 that soon says nothing, as the height of a foot on the ground, is not to follow the noise of its
 first samples into a hop."""
+TOGETHER = 256
+"""Simulations that settle in one batch, at most: their sensitivities are in memory."""
 POOR = 1.3
 """Cost of a segment, relative to that of noise, above which its initial state is sought anew."""
 SMOOTH = 0.3
@@ -82,18 +84,22 @@ def follow(problem: Problem, theta, near: Fit) -> Fit:
 
 
 def follow_each(problem: Problem, thetas: np.ndarray, near: Fit) -> list[Fit]:
-    """Settle the initial states at each of many parameters [K, num_parameters], all in one batch.
+    """Settle the initial states at each of many parameters [K, num_parameters], in batches.
 
     A call of C MuJoCo costs more than a few segments' step in it.
     """
     num = len(near.start)
-    every = np.tile(np.arange(num), len(thetas))
-    found = follow(problem.take(every), np.repeat(thetas, num, axis=0), near.take(every))
-    parts = np.split(np.arange(len(every)), len(thetas))
-    return [
-        dataclasses.replace(found.take(part), theta=theta)
-        for theta, part in zip(thetas, parts, strict=True)
-    ]
+    at_once = max(1, TOGETHER // num)
+    found = []
+    for some in np.split(thetas, range(at_once, len(thetas), at_once)):
+        every = np.tile(np.arange(num), len(some))
+        fits = follow(problem.take(every), np.repeat(some, num, axis=0), near.take(every))
+        parts = np.split(np.arange(len(every)), len(some))
+        found += [
+            dataclasses.replace(fits.take(part), theta=theta)
+            for theta, part in zip(some, parts, strict=True)
+        ]
+    return found
 
 
 def settle_anew(problem: Problem, theta, start: np.ndarray, lin: Linearisation):

@@ -111,7 +111,7 @@ def handmade(predicted, measured, weight) -> Replay:
     segments = Segments(
         measured=measured,
         weight=weight,
-        trust=np.ones_like(measured),
+        trust=np.ones_like(weight),
         start=empty,
         ctrl=empty,
         place=empty,

@@ -82,7 +82,8 @@ class Echo:
     host = None
 
     def predict(self, theta, start, segments):
-        return np.broadcast_to(theta[:, None, None, :], (len(theta), *segments.measured.shape))
+        of_each = theta if theta.ndim > 2 else theta[:, None]
+        return np.broadcast_to(of_each[:, :, None], (len(theta), *segments.measured.shape))
 
 
 def test_each_condition_is_simulated_with_what_is_shared_and_what_is_its_own():
@@ -104,6 +105,9 @@ def test_each_condition_is_simulated_with_what_is_shared_and_what_is_its_own():
     predicted = joint.predict(theta, np.zeros((2, 4, 2)), segments)
     np.testing.assert_array_equal(predicted[0, :, 0], [[1, 0], [1, 0], [2, 0], [1, 3]])
     np.testing.assert_array_equal(predicted[1], 10 * predicted[0])
+    each = np.arange(1.0, 5.0)[None, :, None] * joint.base
+    of_each = joint.predict(each, np.zeros((1, 4, 2)), segments)
+    np.testing.assert_array_equal(of_each[0], np.arange(1, 5)[:, None, None] * predicted[0])
 
 
 def test_a_condition_without_a_file_is_refused(tmp_path, capsys):

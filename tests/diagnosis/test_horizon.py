@@ -47,6 +47,18 @@ def test_what_was_found_lets_a_model_be_followed_for_longer():
     assert cut_longer(longer, recordings, grid, np.asarray([GAIN])) is None
 
 
+def test_segments_are_no_longer_than_the_recordings():
+    spans = ((0, 300),)
+    recordings = [dataclasses.replace(r, spans=spans) for r in record_weak(0.0)]
+    grid = choose_grid(recordings, 0.002)
+    simulator = Simulator(MODEL, (MotorGain("actuator/motor"),), grid)
+    _, segments = choose_horizon(simulator, recordings, grid)
+    problem = Problem(simulator, simulator, segments, segments.recording < 3, 0.004)
+    found = cut_longer(problem, recordings, grid, np.asarray([GAIN]))
+    assert found
+    assert found[0].horizon == pytest.approx(1.0)
+
+
 def test_a_small_effect_is_found_that_a_large_one_hid():
     kinds = ("motor_gain", "torque_offset", "viscous_damping", "coulomb_friction")
     model = dataclasses.replace(MODEL, catalogue={kind: CATALOGUE[kind] for kind in kinds})

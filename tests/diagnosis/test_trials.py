@@ -1,13 +1,11 @@
 """What contacts do to predictions: small steps that tell nothing, samples that count for little."""
 
 import dataclasses
-import types
 
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis.metric import CHATTER, make_metric, trusted
-from garat_jax.diagnosis.segments import QUIET
+from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.trials import enlarge, firsts
 from tests.diagnosis.test_fit import UNIFORM, candidates, column, make_problem, record
@@ -69,24 +67,3 @@ def test_samples_that_half_a_timestep_changes_count_less_and_are_reported_as_the
     held_out = ~problem.fitted
     assert weighed.error(again, held_out) == pytest.approx(raw.error(settled.residual, held_out))
     assert np.abs(again).sum() < 0.7 * np.abs(settled.residual).sum()
-
-
-@pytest.mark.parametrize("moves", [True, False])
-def test_what_hardly_moves_and_chatters_counts_for_next_to_nothing(moves):
-    problem = make_problem([record(UNIFORM)], ())
-
-    def shaken(theta, start, segments):
-        predicted = problem.simulator.predict(theta, start, segments)
-        predicted[..., ::2, 1] += 2.0 * segments.noise[1]
-        return predicted
-
-    segments = problem.segments
-    if not moves:
-        spread = np.asarray([segments.spread[0], QUIET * segments.noise[1]])
-        segments = dataclasses.replace(segments, spread=spread)
-    finer = types.SimpleNamespace(predict=shaken)
-    doubted = dataclasses.replace(problem, segments=segments, finer=finer)
-    settled = settle(doubted, problem.simulator.base, segments.start)
-    trust = trusted(doubted, settled).segments.trust
-    assert trust[..., 0].min() > 0.9
-    assert trust[..., 1].max() == pytest.approx(1.0 if moves else CHATTER, rel=0.1)
