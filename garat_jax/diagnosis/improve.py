@@ -58,7 +58,7 @@ class Improvement:
     def __str__(self) -> str:
         lines = [self.diagnosis.sentence]
         for rung in self.diagnosis.ladder:
-            added = f"+ {rung.added.named}" if rung.added else "the model as it is"
+            added = self.diagnosis.added(rung)
             lines.append(f"  {added}: held-out error {rung.error_holdout:.4g}")
         return "\n".join(lines)
 

@@ -226,6 +226,13 @@ class Diagnosis:
     repeatability: tuple[Repeated, ...] = ()
     conditions: Mapping[str, "Diagnosis"] = dataclasses.field(default_factory=dict)
 
+    def added(self, rung: Rung) -> str:
+        """Say what a rung of the ladder adds, at its final size."""
+        if rung.added is None:
+            return "the model as it is"
+        sizes = {c.named: c.sizes for c in self.selected}
+        return f"+ {rung.added.named} ({sizes[rung.added.named]})"
+
     def to_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json; what is not finite is null."""
         plain = to_plain(dataclasses.replace(self, conditions={}))
@@ -280,8 +287,8 @@ class Diagnosis:
                 f"{fitted if math.isfinite(c.error_after) else ' expected'}; {c.why}"
             )
         for rung in self.ladder:
-            added = str(rung.added.named) if rung.added else "the model as it is"
-            lines.append(f"  {added}: fit {rung.error_fit:.4g}, held-out {rung.error_holdout:.4g}")
+            errors = f"fit {rung.error_fit:.4g}, held-out {rung.error_holdout:.4g}"
+            lines.append(f"  {self.added(rung)}: {errors}")
         lines += [f"  drift: {drift}" for drift in self.drifts]
         if self.next_experiment:
             lines.append(f"  next: {self.next_experiment.how}")

@@ -62,10 +62,12 @@ def test_segments_are_no_longer_than_the_recordings():
 def test_a_small_effect_is_found_that_a_large_one_hid():
     kinds = ("motor_gain", "torque_offset", "viscous_damping", "coulomb_friction")
     model = dataclasses.replace(MODEL, catalogue={kind: CATALOGUE[kind] for kind in kinds})
-    gain, offset = diagnose(model, record_weak(PULL)).selected
+    found = diagnose(model, record_weak(PULL))
+    gain, offset = found.selected
     assert (gain.effect, offset.effect) == ("motor_gain", "torque_offset")
     assert gain.parameters["scale"].estimate == pytest.approx(GAIN, rel=0.01)
     assert offset.parameters["torque"].estimate == pytest.approx(PULL, rel=0.05)
+    assert f"+ torque_offset at joint/hinge ({offset.sizes}): fit " in str(found)
 
 
 SLIDER = """

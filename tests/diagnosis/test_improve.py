@@ -52,7 +52,7 @@ def test_the_ladder_falls_to_the_floor(improved):
     assert content["error"]["after"] < 1.25 * content["error"]["noise_floor"]
     assert content["verdict"] == "missing_effect"
     assert [r["verdict"] for r in content["rounds"]] == ["missing_effect", "adequate"]
-    assert "+ coulomb_friction at joint/hinge: held-out error" in str(done)
+    assert "+ coulomb_friction at joint/hinge (torque 0.07" in str(done)
 
 
 def test_each_recording_alone_shows_the_same_size(improved):
