@@ -146,6 +146,33 @@ def _hidden_effects(result: dict[str, Any]) -> str:
     return table(columns, lines) + text + commits(result["rows"])
 
 
+def timing() -> str:
+    """One row a set: what each tool took and found; mujoco.sysid is told what to fit."""
+    result = read("hidden_effects_timing")
+    rows = []
+    for row in result["rows"]:
+        (secret,) = row["secrets"]
+        ((_, true),) = secret["parameters"].items()
+        ran, theirs = row["sysid_median"] is not None, row["sysid_found"]
+        rows.append(
+            (
+                f"{row['robot']}, 4 × {row['seconds']:g} s, {secret['kind']} {true:g}",
+                f"{row['garat_median']:.1f}",
+                f"{row['limit']:g}",
+                ", ".join(f"{c['effect']} {_sizes(c)}" for c in row["garat_found"]),
+                f"{row['sysid_median']:.1f}" if ran else "–",
+                f"{theirs['estimate']:.4g} ± {theirs['half_interval']:.2g}" if ran else theirs,
+            )
+        )
+    columns = ("set", "diagnosis, s", "held to, s", "found", "mujoco.sysid, s", "fitted")
+    return table(columns, rows) + origin("hidden_effects_timing", result)
+
+
+def _sizes(found: dict[str, Any]) -> str:
+    sizes = found["parameters"].values()
+    return " ".join(f"{v['estimate']:.4g} ± {(v['high'] - v['low']) / 2:.2g}" for v in sizes)
+
+
 def _span(low: float, high: float) -> str:
     return f"≥ {100 * low:.0f} %" if high == 1 else f"{100 * low:.0f}–{100 * high:.0f} %"
 
@@ -261,6 +288,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "fidelity": fidelity,
     "optimisation_level": optimisation_level,
     "hidden_effects": hidden_effects,
+    "timing": timing,
     "real_data": real_data,
     "ground": ground,
 }
