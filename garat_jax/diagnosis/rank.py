@@ -132,8 +132,9 @@ def explain(
     """
     before = settle(problem, problem.simulator.base, start)
     metric = make_metric(problem)
-    adequate = not is_above(problem, metric, before, noise_floor(problem, metric, before))
-    found = _select(problem, before, [], say)
+    floor = noise_floor(problem, metric, before)
+    adequate = not is_above(problem, metric, before, floor)
+    found = _select(problem, before, floor, [], say)
     candidates = found.candidates
     while found.steps and (longer := cut_longer(found.problem, found.fit.theta)):
         again = _go_on(found, *longer, say)
@@ -167,16 +168,16 @@ def _go_on(found: Selection, longer: Problem, settled: Fit, say) -> Selection | 
     longer = trusted(longer, settled)
     say(f"following the recordings for {longer.horizon:.2g} s at a time")
     current = fit(longer, found.fit.theta, settled.start, found.fit.free)
-    again = _select(longer, current, found.steps, say)
+    floor = noise_floor(longer, make_metric(longer), current)
+    again = _select(longer, current, floor, found.steps, say)
     if {step.effect for step in again.steps} <= {step.effect for step in found.steps}:
         return None
     return again._replace(steps=refitted(longer, again.steps, again.fit))
 
 
-def _select(problem: Problem, current: Fit, steps: Sequence[Step], say) -> Selection:
+def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step], say) -> Selection:
     """Add effects to those of some steps, which a fit has already, until none passes every gate."""
     metric = make_metric(problem)
-    floor = noise_floor(problem, metric, current)
     steps, first_round, best, timeless = list(steps), (), None, None
     for number in range(ROUNDS):
         if steps and not is_above(problem, metric, current, floor):
