@@ -79,10 +79,19 @@ def fit_refinements(
     best: Contender,
     scores: Sequence[Score],
     say: Callable[[str], None],
+    hidden_only: bool,
 ) -> list[Contender]:
-    """Fit the laws that refine the best contender's at its place and that screening may not see.
+    """Fit the laws that refine the best contender's at its place.
 
     A law that acted before it was fitted is left as it is.
+
+    Args:
+        problem: The recordings and the model with every candidate.
+        current: The fit of the effects selected so far.
+        best: The contender that fits best.
+        scores: What screening says.
+        say: Told what is being done.
+        hidden_only: Leave out the laws that screening sees, because they have no threshold.
     """
     effects = problem.simulator.effects
     simple = effects[best.score.effect]
@@ -98,12 +107,15 @@ def fit_refinements(
         law = effects[score.effect]
         if law.target != simple.target or simple.kind not in law.refines:
             continue
+        has_threshold = len(law.starts(problem.simulator.host, law.target)) > 1
+        if hidden_only and not has_threshold:
+            continue
         alike = type(law).refined_from(found)
         if not alike:
             continue
         columns = columns_of(problem.simulator.slots, score.effect)
         start = {columns[name]: value for name, value in alike.items()}
-        score = dataclasses.replace(score, columns=tuple(columns.values()), start=start)
+        score = dataclasses.replace(score, columns=tuple(start), start=start)
         contenders.append(_fit(problem, current, score, rival, say))
     return contenders
 

@@ -9,16 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
-from garat_jax.diagnosis.fit import STEP
+from garat_jax.diagnosis.differences import clear_differences
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.problem import (
-    Problem,
-    StartSpace,
-    block_labels,
-    difference_steps,
-    linearise,
-    tall,
-)
+from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels, tall
 from garat_jax.diagnosis.results import Drift, Estimate
 from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.starts import Fit
@@ -54,8 +47,7 @@ def find_drifts(
     free = tuple(j for j in fitted.free if j not in fitted.frozen)
     if not free:
         return ()
-    steps = difference_steps(problem, fitted.theta, free, STEP)
-    lin = linearise(problem, fitted.theta, fitted.start, free, steps)
+    lin = clear_differences(problem, fitted.theta, fitted.start, free).linearisation
     chosen = problem.fitted
     when = time_in_recording(problem, recordings)[chosen, :, None]
     columns = lin.parameters[chosen]

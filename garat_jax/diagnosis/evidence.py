@@ -9,14 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.problem import (
-    Problem,
-    StartSpace,
-    block_labels,
-    difference_steps,
-    linearise,
-    tall,
-)
+from garat_jax.diagnosis.differences import clear_differences
+from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels, tall
 from garat_jax.diagnosis.robust import orthonormal, wald_test, without
 from garat_jax.diagnosis.simulate import Simulator, columns_of
 from garat_jax.diagnosis.starts import Fit
@@ -45,8 +39,8 @@ class Evidence:
     def __init__(self, problem: Problem[Simulator], fit: Fit, chosen: np.ndarray):
         problem, start = problem.take(chosen), fit.start[chosen]
         self._problem, self._theta, self._start = problem, fit.theta, start
-        steps = difference_steps(problem, fit.theta, fit.free, 1e-2)
-        lin = linearise(problem, fit.theta, start, fit.free, steps, fit.sensitivity[chosen])
+        near = fit.sensitivity[chosen]
+        lin = clear_differences(problem, fit.theta, start, fit.free, near).linearisation
         self._space = StartSpace(lin.start)
         self._free = orthonormal(tall(self._space.remove(lin.parameters)))
         self._labels = block_labels(problem).ravel()

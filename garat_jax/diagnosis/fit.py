@@ -11,16 +11,14 @@ from functools import partial
 import numpy as np
 from scipy import optimize, stats
 
-from garat_jax.diagnosis.problem import (
-    Linearisation,
-    Problem,
-    StartSpace,
-    block_labels,
+from garat_jax.diagnosis.differences import (
+    Differences,
+    clear_differences,
     difference_steps,
     is_erratic,
-    linearise,
-    tall,
+    projected,
 )
+from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels, linearise
 from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.starts import (
     KEPT_PROMISE,
@@ -36,14 +34,12 @@ from garat_jax.diagnosis.starts import (
     start_step,
 )
 
-STEP = 1e-2
-"""Finite difference of a fit, relative to a parameter's `scale` or size."""
 FITTED = 1e-4
 """Fall of the cost, relative to it, below which a fit has converged."""
+MOST_DAMPED = 1e4
+"""Damping, relative to what the data say, from which a fit makes no further step."""
 SAME = 0.95
 """Cost with initial states sought anew, relative to that before, above which nothing is new."""
-ALIKE = 0.9
-"""Cosine of a parameter's changes over two steps below which contacts make them, not the law."""
 WIDE = 0.5
 """Finite difference where contacts are erratic, relative to a parameter's `scale` or size."""
 WIDE_STEPS = 4
@@ -93,17 +89,23 @@ def fit(
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
     """
     theta, free = np.array(theta, float), tuple(free)
-    theta, start, lin, keep = _descend(problem, theta, start, free, iterations, rival, sensitivity)
+    descend = partial(_descend, problem, free, iterations, rival)
+    near = clear_differences(problem, theta, start, free, sensitivity)
+    theta, start, lin, keep = descend(theta, start, near, sensitivity is not None)
     descended = start
     start, settled, again = _settle_all(problem, theta, descended, lin)
     if again:
-        near = settled.start
-        theta, descended, lin, keep = _descend(problem, theta, start, free, iterations, rival, near)
+        near = clear_differences(problem, theta, start, free, settled.start)
+        theta, descended, lin, keep = descend(theta, start, near, True)
         start, settled, _ = _settle_all(problem, theta, descended, lin)
-    cost = settled.residual[problem.fitted] ** 2
-    if np.sum(cost) < SEARCHED_WITHIN * rival and _is_erratic(problem, theta, descended, free, lin):
-        near, lin, keep = _fit_across_contacts(problem, settle(problem, theta, start), free)
-        theta, start, settled = near.theta, near.start, lin._replace(start=near.sensitivity)
+    cost = np.sum(settled.residual[problem.fitted] ** 2)
+    if any(is_erratic(column) for column in projected(problem, lin)[0].T):
+        near = clear_differences(problem, theta, descended, free, lin.start)
+        lin = near.linearisation
+    if cost < SEARCHED_WITHIN * rival and not np.all(near.is_clear[keep]):
+        settled = settle(problem, theta, start)
+        found, lin, keep = _fit_across_contacts(problem, settled, free, near.relative)
+        theta, start, settled = found.theta, found.start, lin._replace(start=found.sensitivity)
     low, high = _interval(problem, theta, lin, free, keep)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
     return Fit(theta, free, frozen, start, settled.residual, settled.start, low, high)
@@ -119,30 +121,14 @@ def _settle_all(problem: Problem, theta, start, lin: Linearisation):
     return start, lin, np.sum(lin.residual[problem.fitted] ** 2) < SAME * before
 
 
-def _is_erratic(problem: Problem, theta, start, free, lin: Linearisation) -> bool:
-    """Say whether a parameter changes few samples much, and others when it is moved further.
-
-    Friction changes few samples, too, but the same ones.
-    """
-    near = _projected(problem, lin)[0]
-    keep = _excited(problem, free, near) & [is_erratic(column) for column in near.T]
-    if not np.any(keep):
-        return False
-    steps = difference_steps(problem, theta, free, 10.0 * STEP)
-    far = _projected(problem, linearise(problem, theta, start, free, steps, lin.start))[0]
-    size = np.linalg.norm(near, axis=0) * np.linalg.norm(far, axis=0)
-    alike = np.abs(np.sum(near * far, axis=0)) / np.maximum(size, 1e-300)
-    return bool(np.any(alike[keep] < ALIKE))
-
-
-def _wide(problem: Problem, near: Fit, free) -> Linearisation:
+def _wide(problem: Problem, near: Fit, free, relative) -> Linearisation:
     """Measure sensitivities over wide steps, initial states settled at both ends of each.
 
     Contacts that open or close a step of the engine earlier change what follows by an amount that
     does not shrink with the perturbation; over a wide one these changes average out. What initial
     states do is in these sensitivities already: those to them are 0.
     """
-    steps = difference_steps(problem, near.theta, free, WIDE)
+    steps = difference_steps(problem, near.theta, free, np.maximum(relative, WIDE))
     thetas = np.tile(near.theta, (len(free), 1))
     thetas[np.arange(len(free)), list(free)] += steps
     moved = follow_each(problem, thetas, near)
@@ -151,32 +137,33 @@ def _wide(problem: Problem, near: Fit, free) -> Linearisation:
     return Linearisation(near.residual, np.stack(columns, -1), nothing)
 
 
-def _fit_across_contacts(problem: Problem, near: Fit, free):
+def _fit_across_contacts(problem: Problem, near: Fit, free, relative):
     """Search if more is left than noise, and take Gauss-Newton steps with `_wide` differences.
 
     Args:
         problem: What is fitted.
         near: What Gauss-Newton steps have reached, initial states settled.
         free: Indices of the parameters to fit.
+        relative: Their finite differences; see `Differences`.
 
     Returns:
         The best that was reached, the linearisation there, and which parameters are excited.
     """
     if _cost(problem, near) > SEARCHED_ABOVE * problem.expected[problem.fitted].sum():
-        found = settle(problem, _search(problem, near, free), near.start)
+        found = settle(problem, _search(problem, near, free, relative), near.start)
         near = min((near, found), key=partial(_cost, problem))
-    stepped = _wide_step(problem, near, free)
+    stepped = _wide_step(problem, near, free, relative)
     for _ in range(WIDE_STEPS - 1):
         if _cost(problem, stepped[0]) > SEARCH_ON * _cost(problem, near):
             break
         near = stepped[0]
-        stepped = _wide_step(problem, near, free)
+        stepped = _wide_step(problem, near, free, relative)
     return stepped
 
 
-def _wide_step(problem: Problem, near: Fit, free):
+def _wide_step(problem: Problem, near: Fit, free, relative):
     """Take a Gauss-Newton step with `_wide` differences; see `_fit_across_contacts`."""
-    lin = _wide(problem, near, free)
+    lin = _wide(problem, near, free, relative)
     change, keep = _parameter_step(problem, near.theta, lin, free, 1e-4)
     theta = near.theta.copy()
     theta[list(free)] += change
@@ -188,7 +175,7 @@ def _cost(problem: Problem, of: Fit) -> float:
     return float(of.cost[problem.fitted].sum())
 
 
-def _search(problem: Problem, near: Fit, free) -> np.ndarray:
+def _search(problem: Problem, near: Fit, free, relative) -> np.ndarray:
     """Fit parameters to some of the segments by compass search, initial states settled each time.
 
     (Kolda, Lewis and Torczon 2003.) No derivative is trusted; steps double and shrink.
@@ -196,7 +183,8 @@ def _search(problem: Problem, near: Fit, free) -> np.ndarray:
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SEARCHED)]
     problem, near = problem.take(chosen), near.take(chosen)
-    steps = np.abs(difference_steps(problem, near.theta, free, WIDE))
+    steps = difference_steps(problem, near.theta, free, np.maximum(relative, WIDE))
+    steps = np.abs(steps)
     least = FINEST * steps
     parameters = [problem.simulator.slots[j].parameter for j in free]
     low, high = ([getattr(p, end) for p in parameters] for end in ("low", "high"))
@@ -216,8 +204,27 @@ def _search(problem: Problem, near: Fit, free) -> np.ndarray:
     return near.theta
 
 
-def _descend(problem: Problem, theta, start, free, iterations: int, rival: float, sensitivity):
+def _descend(
+    problem: Problem,
+    free,
+    iterations: int,
+    rival: float,
+    theta,
+    start,
+    near: Differences,
+    is_stale: bool,
+):
     """Take Gauss-Newton steps of parameters and initial states together; see `fit`.
+
+    Args:
+        problem: What is fitted.
+        free: Indices of the parameters to fit.
+        iterations: Largest number of steps.
+        rival: As for `fit`.
+        theta: Where to start, [num_parameters].
+        start: Initial states, [S, nq + nv].
+        near: Differences there; their relative steps are kept.
+        is_stale: Whether their derivatives by the initial states are from elsewhere.
 
     Returns:
         Parameters, initial states, the linearisation at them, and which parameters are excited.
@@ -225,18 +232,17 @@ def _descend(problem: Problem, theta, start, free, iterations: int, rival: float
     damping, undamped = 1e-4, np.zeros(len(start))
 
     def at(theta, start, sensitivity) -> Linearisation:
-        steps = difference_steps(problem, theta, free, STEP)
+        steps = difference_steps(problem, theta, free, near.relative)
         return linearise(problem, theta, start, free, steps, sensitivity)
 
-    lin = at(theta, start, sensitivity)
-    keep, is_stale = np.ones(len(free), bool), sensitivity is not None
+    lin, keep = near.linearisation, np.ones(len(free), bool)
     for taken in range(iterations):
         change, keep = _parameter_step(problem, theta, lin, free, damping)
         expected = lin.residual + lin.parameters @ change
         start_change = start_step(problem, lin, expected, undamped, 0.0)
         before = np.sum(lin.residual[problem.fitted] ** 2)
         promised = promised_costs(lin, expected, start_change)[problem.fitted].sum()
-        if before - promised < FITTED * before or damping > 1e8:
+        if before - promised < FITTED * before or damping > MOST_DAMPED:
             break
         if taken > 1 and promised > BEATEN * rival:
             break
@@ -265,13 +271,6 @@ def _descend(problem: Problem, theta, start, free, iterations: int, rival: float
     return theta, start, lin, keep
 
 
-def _projected(problem: Problem, lin: Linearisation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fitted segments' sensitivities [M, k] and residual [M], initial states removed."""
-    both = np.concatenate([lin.parameters, lin.residual[..., None]], axis=2)[problem.fitted]
-    rest = tall(StartSpace(lin.start[problem.fitted]).remove(both))
-    return rest[:, :-1], rest[:, -1]
-
-
 def _excited(problem: Problem, free, sensitivity: np.ndarray) -> np.ndarray:
     """Say which parameters would show within their bounds, [k] bool."""
     width = [
@@ -283,7 +282,7 @@ def _excited(problem: Problem, free, sensitivity: np.ndarray) -> np.ndarray:
 
 def _parameter_step(problem: Problem, theta, lin: Linearisation, free, damping: float):
     """Return a damped step within the bounds [k], and which parameters are excited."""
-    sensitivity, residual = _projected(problem, lin)
+    sensitivity, residual = projected(problem, lin)
     keep = _excited(problem, free, sensitivity)
     slots = [problem.simulator.slots[j].parameter for j in np.asarray(free)[keep]]
     step = np.zeros(len(free))
@@ -309,7 +308,7 @@ def _interval(problem: Problem, theta, lin: Linearisation, free, keep):
     low, high = np.full(len(free), -np.inf), np.full(len(free), np.inf)
     if not np.any(keep):
         return low, high
-    sensitivity, residual = _projected(problem, lin)
+    sensitivity, residual = projected(problem, lin)
     labels = block_labels(problem)[problem.fitted].ravel()
     found = regress(sensitivity[:, keep], residual, labels)
     half = stats.t.ppf(0.975, found.freedom) * np.sqrt(np.diag(found.covariance))
@@ -329,13 +328,13 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     if not np.any(keep):
         return fitted
     free, theta, start = fitted.free, fitted.theta, fitted.start
-    steps = difference_steps(problem, theta, free, STEP)
-    lin = linearise(problem, theta, start, free, steps)
-    if _is_erratic(problem, theta, start, free, lin):
-        lin = _wide(problem, fitted, free)
+    differences = clear_differences(problem, theta, start, free)
+    lin = differences.linearisation
+    if not np.all(differences.is_clear[keep]):
+        lin = _wide(problem, fitted, free, differences.relative)
     halved = problem.integrator_error(theta, start, fitted.residual)
     near = lin._replace(start=fitted.sensitivity)
-    sensitivity, change = _projected(problem, near._replace(residual=2.0 * halved))
+    sensitivity, change = projected(problem, near._replace(residual=2.0 * halved))
     labels = block_labels(problem)[problem.fitted].ravel()
     moved = theta.copy()
     moved[np.asarray(free)[keep]] += regress(sensitivity[:, keep], change, labels).coefficient
@@ -358,7 +357,7 @@ def _does_as_promised(problem: Problem, half: Linearisation, theta, start, free,
     moved = theta.copy()
     moved[list(free)] += shift
     there = problem.integrator_error(moved, start, np.zeros_like(half.residual))
-    sensitivity, before = _projected(problem, half)
-    _, found = _projected(problem, half._replace(residual=there))
+    sensitivity, before = projected(problem, half)
+    _, found = projected(problem, half._replace(residual=there))
     promised = np.sum(before**2) - np.sum((before + sensitivity @ shift) ** 2)
     return bool(np.sum(before**2) - np.sum(found**2) >= KEPT_PROMISE * promised)

@@ -90,14 +90,14 @@ def _alike(contenders: list[Contender], current: Fit, drawn: np.ndarray, index: 
 
 
 def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, drawn):
-    contender, held_out = contenders[index], ~problem.fitted
+    contender = contenders[index]
     alike = _alike(contenders, current, drawn, index)
     others = [i for i in range(len(contenders)) if i != index and i not in alike]
     stability = float(np.mean(np.isin(drawn.argmin(axis=1), [index, *alike])))
     lead = np.inf
     if others:
         lead = float(np.quantile(drawn[:, others].min(axis=1) - drawn[:, index], 0.025))
-    gain = _gain(problem, metric, current, contender.fit, held_out)
+    gain = held_out_gain(problem, metric, current, contender.fit)
     share = 1.0 - contender.fit.cost[problem.fitted].sum() / current.cost[problem.fitted].sum()
     why = _failed_gate(contender.score, share, gain, lead, stability)
     effects = problem.simulator.effects
@@ -108,7 +108,7 @@ def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, dr
         parameters=estimates(problem, contender.score.effect, contender.fit),
         share=float(share),
         p_value=contender.score.p_value,
-        error_after=metric.error(contender.fit.residual, held_out),
+        error_after=metric.error(contender.fit.residual, ~problem.fitted),
         held_out_gain=gain,
         stability=stability,
         indistinguishable_from=tuple(Named(e.kind, e.target) for e in named),
@@ -133,8 +133,9 @@ def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stabil
     return ""
 
 
-def _gain(problem, metric: Metric, before: Fit, after: Fit, held_out) -> Interval:
+def held_out_gain(problem: Problem, metric: Metric, before: Fit, after: Fit) -> Interval:
     """Return the fall of the held-out error with a block-bootstrap interval."""
+    held_out = ~problem.fitted
     costs = _block_costs(problem, metric.weight, [before, after], held_out)
     count = metric.count(held_out)
     drawn = np.sqrt(_resamples(costs.shape[1]) @ costs.T / count)

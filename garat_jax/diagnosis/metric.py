@@ -56,12 +56,12 @@ def make_metric(problem: Problem) -> Metric:
     spread = np.maximum(s.measured[held_out].std(axis=0), QUIET * s.noise)
     weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
     num_signals = s.measured.shape[2]
-    counted, trust = (np.repeat(x, num_signals, axis=1) for x in (s.weight > 0, s.trust))
-    return Metric(weight, counted, trust, spread)
+    counted = np.repeat(s.weight > 0, num_signals, axis=1)
+    return Metric(weight, counted, s.trust.reshape(counted.shape), spread)
 
 
 def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
-    """Let samples count less that the model's timestep does not let it predict.
+    """Let samples of a signal count less that the model's timestep does not let it predict.
 
     Where half a timestep changes a prediction by many standard deviations of noise, as after an
     impact, a residual says nothing of the model's physics. Such changes last to the end of a
@@ -73,8 +73,8 @@ def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
     """
     segments = problem.segments
     shape = segments.measured.shape
-    squares = [np.mean(x.reshape(shape) ** 2, axis=2) for x in timestep_error(problem, settled)]
-    size = np.sqrt(np.maximum.accumulate(np.minimum(*squares), axis=1))
+    sizes = [np.abs(x).reshape(shape) for x in timestep_error(problem, settled)]
+    size = np.maximum.accumulate(np.minimum(*sizes), axis=1)
     trust = 1.0 / np.maximum(1.0, size / TRUSTED)
     return dataclasses.replace(problem, segments=dataclasses.replace(segments, trust=trust))
 

@@ -1,8 +1,8 @@
 """What is fitted to what, and how the residuals change with parameters and initial states.
 
 Residuals are prediction minus measurement, in units of each signal's noise, and count as far as a
-sample is trusted. Sensitivities to the
-parameters and to the initial states come from the same batched simulation.
+sample is trusted. Sensitivities to the parameters and to the initial states come from the same
+batched simulation.
 """
 
 import dataclasses
@@ -20,8 +20,6 @@ BLOCK = 0.25
 """Seconds of the shortest block within which errors may be correlated, in robust variances."""
 START_STEP = 1e-4
 """Finite difference of an initial state, relative to its spread."""
-ERRATIC = 10.0
-"""Root mean square of a change, relative to its median size, above which few samples make it."""
 LARGE = 1e8
 """Whitened residual that stands for a simulation that diverged."""
 
@@ -117,7 +115,7 @@ class Problem(Generic[AnySimulator]):
     def scale(self) -> np.ndarray:
         """Return what a deviation counts, [S, L, num_signals]."""
         s = self.segments
-        return (s.weight * s.trust)[..., None] / s.noise
+        return s.weight[..., None] * s.trust / s.noise
 
     @property
     def expected(self) -> np.ndarray:
@@ -205,22 +203,6 @@ class StartSpace:
     def remove(self, columns: np.ndarray) -> np.ndarray:
         """Project columns [S, N, k] onto what no initial state can make."""
         return columns - self.basis @ (np.swapaxes(self.basis, 1, 2) @ columns)
-
-
-def difference_steps(problem: Problem, theta: np.ndarray, columns, relative: float) -> np.ndarray:
-    """Return finite differences for some parameters that stay within their bounds."""
-    steps = []
-    for j in columns:
-        p = problem.simulator.slots[j].parameter
-        size = relative * max(p.scale, 0.1 * min(abs(theta[j] - p.nominal), abs(theta[j])))
-        steps.append(size if theta[j] + size <= p.high else -size)
-    return np.asarray(steps)
-
-
-def is_erratic(change: np.ndarray) -> bool:
-    """Say whether a perturbation changes few of the samples [M] much and most hardly."""
-    size = np.abs(change)
-    return bool(0 < ERRATIC * np.median(size) < np.sqrt(np.mean(size**2)))
 
 
 def block_labels(problem: Problem) -> np.ndarray:

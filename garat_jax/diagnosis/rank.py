@@ -21,7 +21,14 @@ from garat_jax.diagnosis.contend import (
     with_twins,
 )
 from garat_jax.diagnosis.fit import count_timestep, fit
-from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD, Judged, estimates, judge, leads
+from garat_jax.diagnosis.judge import (
+    NO_CERTAIN_LEAD,
+    Judged,
+    estimates,
+    held_out_gain,
+    judge,
+    leads,
+)
 from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor, trusted
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Candidate, Named
@@ -275,10 +282,15 @@ def _num_tried(problem: Problem, scores: Sequence[Score]) -> int:
 def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):
     """Replace the best contender where a refinement, or more of its law, certainly explains more.
 
-    Screening prefers the simpler law, because a refinement's threshold hides it there.
+    Screening prefers the simpler law. A refinement's threshold hides it there; one without waits
+    for the next round, where other effects rival it, if the simpler law proves itself.
     """
+
+    def proves_itself(best: Contender) -> bool:
+        return held_out_gain(problem, metric, current, best.fit).low > 0
+
     for find in (
-        lambda best: fit_refinements(problem, current, best, scores, say),
+        lambda best: fit_refinements(problem, current, best, scores, say, proves_itself(best)),
         lambda best: fit_further(problem, best, say),
     ):
         best = min(contenders, key=lambda c: c.fit.cost.sum(), default=None)

@@ -38,7 +38,8 @@ class Segments:
     Attributes:
         measured: Measured signals, [S, L, num_signals].
         weight: 1 for a sample, 0 for padding, [S, L].
-        trust: How much the residual of a sample counts, 0 to 1, [S, L]; see `metric.trusted`.
+        trust: How much a sample's residual counts, 0 to 1, [S, L, num_signals]; see
+            `metric.trusted`.
         start: Measured initial state (qpos, qvel), [S, nq + nv].
         ctrl: Command of every simulated step, the warm-up's first, [S, warm_up + steps, nu].
         place: Where a sample lies between simulated steps, [S, L].
@@ -144,7 +145,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     return Segments(
         measured=measured,
         weight=weight,
-        trust=np.ones_like(weight),
+        trust=np.ones_like(measured),
         start=start,
         ctrl=ctrl,
         place=place,

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.problem import is_erratic
+from garat_jax.diagnosis.differences import is_erratic
 from garat_jax.diagnosis.simulate import Simulator, columns_of
 from garat_jax.effects import Effect
 

@@ -238,9 +238,10 @@ class Effect(abc.ABC):
 
     @classmethod
     def refined_from(cls, simpler: "Effect") -> Mapping[str, float]:
-        """Return parameters near which this law is like one that it refines.
+        """Return the parameters that are fitted first, and with which it is like a simpler law.
 
-        Only a law that shows beyond a threshold needs them, because screening may not see it.
+        Screening may not see a law that shows beyond a threshold, and makes little of what two
+        directions differ by where it makes little of either. Without any, the law is left to it.
 
         Args:
             simpler: An effect of a kind in `refines`, with values.

@@ -207,6 +207,14 @@ class AsymmetricFriction(VaryingFriction):
         source="As viscous_damping",
     )
 
+    @classmethod
+    def refined_from(cls, simpler: Effect) -> Mapping[str, float]:
+        """Begin with the same friction in both directions, dry or viscous as it is."""
+        (first,) = simpler.parameters()
+        size = float(getattr(simpler, first.name))
+        part = "coulomb" if simpler.kind == "coulomb_friction" else "viscous"
+        return {f"{part}_positive": size, f"{part}_negative": size}
+
     def steady(self) -> jax.Array:
         """Return the mean of both directions."""
         return 0.5 * (self.coulomb_positive + self.coulomb_negative)

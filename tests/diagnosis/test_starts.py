@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis.contend import Contender, fit_further
+from garat_jax.diagnosis.differences import is_erratic
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.problem import Problem, is_erratic, linearise
+from garat_jax.diagnosis.problem import Problem, linearise
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator, columns_of

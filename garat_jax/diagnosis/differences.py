@@ -1,0 +1,115 @@
+"""Derivatives by parameters from finite differences that stand out from the jumps of contacts."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from garat_jax.diagnosis.problem import Linearisation, Problem, StartSpace, linearise, tall
+
+STEP = 1e-2
+"""Finite difference where predictions are smooth, relative to a parameter's `scale` or size."""
+WIDER = 10.0**0.5
+"""Factor from one step to the next that is tried where they jump."""
+ROOM = 0.3
+"""Largest step, relative to the width of a parameter's bounds."""
+ALIKE = 0.9
+"""Cosine of a parameter's changes over two steps below which contacts make them, not the law."""
+ERRATIC = 10.0
+"""Root mean square of a change, relative to its median size, above which few samples make it."""
+
+
+class Differences(NamedTuple):
+    """Finite differences of some parameters, and what they show.
+
+    Attributes:
+        relative: Steps, relative to each parameter's `scale` or size, [k].
+        is_clear: Whether a parameter's law makes its change, not the jumps of contacts, [k].
+        linearisation: With these steps.
+    """
+
+    relative: np.ndarray
+    is_clear: np.ndarray
+    linearisation: Linearisation
+
+
+def clear_differences(
+    problem: Problem, theta, start, free, sensitivity: np.ndarray | None = None
+) -> Differences:
+    """Linearise with steps as wide as it takes.
+
+    Contacts that open or close a step of the engine earlier change what follows by an amount that
+    does not shrink with the perturbation. Steps are widened where a change is erratic until two in
+    a row change the same samples, initial states projected out; if none do, those count that come
+    nearest to it. (Friction changes few samples, too, but the same ones.)
+
+    Args:
+        problem: What is fitted.
+        theta: All parameters, [num_parameters].
+        start: Initial states, [S, nq + nv].
+        free: Indices of the parameters.
+        sensitivity: As for `linearise`.
+    """
+    free = np.asarray(free, int)
+    relative, alike = np.full(len(free), STEP), np.ones(len(free))
+    steps = difference_steps(problem, theta, free, relative)
+    lin = linearise(problem, theta, start, free, steps, sensitivity)
+    last, _ = projected(problem, lin)
+    tried = np.flatnonzero([is_erratic(column) for column in last.T])
+    alike[tried] = 0.0
+    wider = STEP
+    while len(tried):
+        wider *= WIDER
+        steps = difference_steps(problem, theta, free[tried], wider)
+        far = linearise(problem, theta, start, free[tried], steps, lin.start)
+        changes, _ = projected(problem, far)
+        cosine = _cosine(changes, last[:, tried])
+        last[:, tried] = changes
+        better = cosine > alike[tried]
+        chosen = tried[better]
+        relative[chosen], alike[chosen] = wider, cosine[better]
+        lin.parameters[..., chosen] = far.parameters[..., better]
+        room = ROOM * _widths(problem, free[tried])
+        tried = tried[(cosine < ALIKE) & (WIDER * np.abs(steps) < room)]
+    return Differences(relative, alike >= ALIKE, lin)
+
+
+def difference_steps(problem: Problem, theta: np.ndarray, columns, relative) -> np.ndarray:
+    """Return finite differences for some parameters that stay within their bounds.
+
+    Args:
+        problem: What is fitted.
+        theta: All parameters, [num_parameters].
+        columns: Indices of those to perturb, k of them.
+        relative: Steps, relative to each parameter's `scale` or size, a number or [k].
+    """
+    steps = []
+    for j, size in zip(columns, np.broadcast_to(relative, len(columns)), strict=True):
+        p = problem.simulator.slots[j].parameter
+        step = size * max(p.scale, 0.1 * min(abs(theta[j] - p.nominal), abs(theta[j])))
+        steps.append(step if theta[j] + step <= p.high else -step)
+    return np.asarray(steps)
+
+
+def is_erratic(change: np.ndarray) -> bool:
+    """Say whether a perturbation changes few of the samples [M] much and most hardly."""
+    size = np.abs(change)
+    return bool(0 < ERRATIC * np.median(size) < np.sqrt(np.mean(size**2)))
+
+
+def projected(problem: Problem, lin: Linearisation) -> tuple[np.ndarray, np.ndarray]:
+    """Return the fitted segments' sensitivities [M, k] and residual [M], initial states removed."""
+    both = np.concatenate([lin.parameters, lin.residual[..., None]], axis=2)[problem.fitted]
+    rest = tall(StartSpace(lin.start[problem.fitted]).remove(both))
+    return rest[:, :-1], rest[:, -1]
+
+
+def _cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the cosine of the angle between the lines along each column of two matrices, [k]."""
+    size = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
+    return np.abs(np.sum(a * b, axis=0)) / np.maximum(size, 1e-300)
+
+
+def _widths(problem: Problem, columns) -> np.ndarray:
+    """Return the width of some parameters' bounds, [k]."""
+    slots = [problem.simulator.slots[j].parameter for j in columns]
+    return np.asarray([p.high - p.low for p in slots])
