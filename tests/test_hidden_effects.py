@@ -113,6 +113,19 @@ def test_dry_friction_has_the_size_of_its_law():
         assert model.dof_frictionloss[1] == pytest.approx(size)
 
 
+@pytest.mark.parametrize(
+    "robot, joint", [("hopper", "knee"), ("hopper", "height"), ("pendulum", "hinge")]
+)
+def test_a_spring_pulls_to_its_reference_in_radians_or_metres(robot, joint):
+    numbers = {"stiffness": 2.0, "reference": -0.3}
+    spring, scene = made("joint_stiffness", robot, f"joint/{joint}", **numbers)
+    model = truth_model(spring, scene)
+    data = mujoco.MjData(model)
+    data.qpos[int(model.joint(joint).qposadr[0])] = 0.5
+    mujoco.mj_forward(model, data)
+    assert data.qfrc_spring[int(model.joint(joint).dofadr[0])] == pytest.approx(-2.0 * 0.8)
+
+
 def test_gravity_turns_by_roll_and_then_pitch():
     tilt, scene = made("gravity_tilt", "arm2", "world", roll=0.3, pitch=-0.2)
     g = 9.81

@@ -142,8 +142,10 @@ class JointStiffness(AtJoint):
         }
 
     def change(self, spec, scene):
-        joint = spec.joint(self.name)
-        joint.stiffness[0], joint.springref = self["stiffness"], self["reference"]
+        joint, reference = spec.joint(self.name), self["reference"]
+        degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+        joint.springref = np.rad2deg(reference) if degrees else reference
+        joint.stiffness[0] = self["stiffness"]
 
 
 class TorqueOffset(AtJoint):

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from garat_jax.diagnosis.differences import (
+    STEP,
     Differences,
     clear_differences,
     difference_steps,
@@ -36,6 +37,9 @@ from garat_jax.diagnosis.starts import (
 
 FITTED = 1e-4
 """Fall of the cost, relative to it, below which a fit has converged."""
+STALLED = 3
+"""Steps in a row, none of which lowers the cost by `FITTED`, after which a fit across contacts has
+converged, too: initial states promise for ever what jumps do not let them keep."""
 MOST_DAMPED = 1e4
 """Damping, relative to what the data say, from which a fit makes no further step."""
 SAME = 0.95
@@ -229,7 +233,8 @@ def _descend(
     Returns:
         Parameters, initial states, the linearisation at them, and which parameters are excited.
     """
-    damping, undamped = 1e-4, np.zeros(len(start))
+    damping, undamped, stalled = 1e-4, np.zeros(len(start)), 0
+    patience = STALLED if np.any(near.relative > STEP) else iterations
 
     def at(theta, start, sensitivity) -> Linearisation:
         steps = difference_steps(problem, theta, free, near.relative)
@@ -242,7 +247,7 @@ def _descend(
         start_change = start_step(problem, lin, expected, undamped, 0.0)
         before = np.sum(lin.residual[problem.fitted] ** 2)
         promised = promised_costs(lin, expected, start_change)[problem.fitted].sum()
-        if before - promised < FITTED * before or damping > MOST_DAMPED:
+        if before - promised < FITTED * before or damping > MOST_DAMPED or stalled == patience:
             break
         if taken > 1 and promised > BEATEN * rival:
             break
@@ -257,6 +262,7 @@ def _descend(
             starts = np.where(better[:, None], start, starts)
             trial = choose(better, stayed, trial)
             fall = before - np.sum(trial.residual[problem.fitted] ** 2)
+        stalled = 0 if fall > FITTED * before else stalled + 1
         if fall > 0:
             follows = np.sum(trial.residual**2, 1) < np.sum(lin.residual**2, 1)
             moved = problem.fitted | follows
