@@ -14,7 +14,7 @@ ROOM = 0.3
 """Largest step, relative to the width of a parameter's bounds."""
 ALIKE = 0.9
 """Cosine of a parameter's changes over two steps below which contacts make them, not the law."""
-ERRATIC = 10.0
+ERRATIC = 5.0
 """Root mean square of a change, relative to its median size, above which few samples make it."""
 
 
@@ -62,7 +62,7 @@ def clear_differences(
         steps = difference_steps(problem, theta, free[tried], wider)
         far = linearise(problem, theta, start, free[tried], steps, lin.start)
         changes, _ = projected(problem, far)
-        cosine = _cosine(changes, last[:, tried])
+        cosine = cosines(changes, last[:, tried])
         last[:, tried] = changes
         better = cosine > alike[tried]
         chosen = tried[better]
@@ -103,7 +103,7 @@ def projected(problem: Problem, lin: Linearisation) -> tuple[np.ndarray, np.ndar
     return rest[:, :-1], rest[:, -1]
 
 
-def _cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the cosine of the angle between the lines along each column of two matrices, [k]."""
     size = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
     return np.abs(np.sum(a * b, axis=0)) / np.maximum(size, 1e-300)

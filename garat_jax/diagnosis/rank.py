@@ -84,7 +84,8 @@ class Outcome(NamedTuple):
         steps: The effects added, in order, each with the fit at the time.
         selected: The effects kept in the end, with their final parameters.
         floor: Noise floor of the metric on the held-out segments.
-        adequate: Whether the model as it is comes near its noise floor in every signal.
+        adequate: Whether the model as it is comes near its noise floor in every signal, and
+            nothing was found.
         best: The fit that says most of what is left: all selected effects, or the best candidate
             that was not; None where nothing is left or nothing was fitted.
     """
@@ -143,7 +144,7 @@ def explain(
     adequate = not is_above(problem, metric, before, floor)
     found = _select(problem, before, floor, [], say)
     candidates = found.candidates
-    while found.steps and (longer := cut_longer(found.problem, found.fit.theta)):
+    while (found.steps or adequate) and (longer := cut_longer(found.problem, found.fit.theta)):
         again = _go_on(found, *longer, say)
         if again is None:
             break
@@ -165,7 +166,7 @@ def explain(
         tuple(steps),
         selected,
         found.floor.error,
-        adequate,
+        adequate and not steps,
         best,
     )
 

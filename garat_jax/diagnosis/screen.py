@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from garat_jax.diagnosis.differences import ALIKE, cosines
 from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.robust import orthonormal, without
@@ -122,9 +123,13 @@ def _measure(problem: Problem[Simulator], theta: np.ndarray, evidence: Evidence,
 
     rows, trials = firsts(simulator, theta, skip)
     changes = change(rows)
-    rows, trials, larger = enlarge(simulator, rows, trials, changes, residual)
+    larger = enlarge(simulator, rows, trials, changes, residual)
     if larger:
-        changes[:, larger] = change([rows[i] for i in larger])
+        found = change([row for row, _ in larger.values()])
+        jumps = cosines(found, changes[:, list(larger)]) < ALIKE
+        for (index, (row, trial)), new, jump in zip(larger.items(), found.T, jumps, strict=True):
+            if jump:
+                rows[index], trials[index], changes[:, index] = row, trial, new
     num_firsts = len(rows)
     rows, trials = others(simulator, theta, rows, best_sizes(trials, changes, residual))
     if more := rows[num_firsts:]:

@@ -120,28 +120,27 @@ def enlarge(
     trials: list[Trial],
     changes: np.ndarray,
     residual: np.ndarray,
-) -> tuple[list[Row], list[Trial], list[int]]:
-    """Take larger steps where a small one changes few samples much and most hardly.
+) -> dict[int, tuple[Row, Trial]]:
+    """Return larger steps for where a small one changes few samples much and most hardly.
 
     Contacts that open or close a step of the engine earlier change what follows by an amount that
     does not shrink with the perturbation: divided by a small step it drowns the rest. The new step
-    changes the median sample as much as the residual's is.
+    changes the median sample as much as the residual's is. (Friction changes few samples, too, but
+    the same ones with either step.)
 
     Args:
         simulator: The model with all candidates.
         rows: One a trial.
-        trials: The candidates at their sizes.
+        trials: The candidates at their sizes, in the order of the rows.
         changes: What the rows change, [M, rows].
         residual: [M].
 
     Returns:
-        The rows, the trials, which start from them, and the indices of the rows that are new.
+        A row and the trial that starts from it, by the index of those they may replace.
     """
     wanted = float(np.median(np.abs(residual)))
-    rows, trials, larger = list(rows), list(trials), []
-    for number, trial in enumerate(trials):
-        (index,) = trial.rows
-        row = rows[index]
+    larger = {}
+    for index, (row, trial) in enumerate(zip(rows, trials, strict=True)):
         if not trial.is_only or len(row.values) > 1 or not is_erratic(changes[:, index]):
             continue
         median = float(np.median(np.abs(changes[:, index])))
@@ -151,9 +150,5 @@ def enlarge(
         step = np.sign(row.step) * min(wanted / median * abs(row.step), ROOM * room)
         if abs(step) > abs(row.step):
             start = {row.column: base + step}
-            rows[index], trials[number] = (
-                Row(row.column, start, step, -1),
-                trial._replace(start=start),
-            )
-            larger.append(index)
-    return rows, trials, larger
+            larger[index] = Row(row.column, start, step, -1), trial._replace(start=start)
+    return larger

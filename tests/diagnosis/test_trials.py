@@ -36,17 +36,16 @@ def test_steps_grow_where_few_samples_make_the_change():
     )
     changes = np.full((1000, len(rows)), 1e-3)
     changes[::100, friction] = 10.0
-    larger, started, new = enlarge(simulator, rows, trials, changes, np.full(1000, 0.5))
-    assert new == [friction]
-    assert larger[friction].step == pytest.approx(500 * rows[friction].step)
-    column_, base = rows[friction].column, simulator.base
-    assert larger[friction].values[column_] == pytest.approx(base[column_] + larger[friction].step)
-    (trial,) = (t for t in started if t.rows == (friction,))
-    assert trial.start == larger[friction].values
-    assert larger[damping] == rows[damping]
-    p = simulator.slots[column_].parameter
-    far, _, _ = enlarge(simulator, rows, trials, changes, np.full(1000, 1e9))
-    assert far[friction].step == pytest.approx(0.3 * (p.high - p.low))
+    larger = enlarge(simulator, rows, trials, changes, np.full(1000, 0.5))
+    assert friction in larger and damping not in larger
+    row, trial = larger[friction]
+    assert row.step == pytest.approx(500 * rows[friction].step)
+    assert row.values[row.column] == pytest.approx(simulator.base[row.column] + row.step)
+    assert trial.rows == (friction,)
+    assert trial.start == row.values
+    p = simulator.slots[row.column].parameter
+    far, _ = enlarge(simulator, rows, trials, changes, np.full(1000, 1e9))[friction]
+    assert far.step == pytest.approx(0.3 * (p.high - p.low))
 
 
 def test_samples_that_half_a_timestep_changes_count_less_and_are_reported_as_they_are():
