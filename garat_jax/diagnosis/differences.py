@@ -10,10 +10,11 @@ STEP = 1e-2
 """Finite difference where predictions are smooth, relative to a parameter's `scale` or size."""
 WIDER = 10.0**0.5
 """Factor from one step to the next that is tried where they jump."""
-ROOM = 0.3
+WIDEST = 0.3
 """Largest step, relative to the width of a parameter's bounds."""
-ALIKE = 0.9
-"""Cosine of a parameter's changes over two steps below which contacts make them, not the law."""
+ALIKE = 0.8
+"""Cosine of a step's change and what the next one adds to it below which contacts make them, not
+the law."""
 ERRATIC = 5.0
 """Root mean square of a change, relative to its median size, above which few samples make it."""
 
@@ -38,9 +39,9 @@ def clear_differences(
     """Linearise with steps as wide as it takes.
 
     Contacts that open or close a step of the engine earlier change what follows by an amount that
-    does not shrink with the perturbation. Steps are widened where a change is erratic until two in
-    a row change the same samples, initial states projected out; if none do, those count that come
-    nearest to it. (Friction changes few samples, too, but the same ones.)
+    does not shrink with the perturbation. Steps are widened where a change is erratic until the
+    next wider one adds more of the same, initial states projected out; if none does, those count
+    that come nearest to it. (Friction changes few samples, too, but the same ones.)
 
     Args:
         problem: What is fitted.
@@ -57,19 +58,22 @@ def clear_differences(
     tried = np.flatnonzero([is_erratic(column) for column in last.T])
     alike[tried] = 0.0
     wider = STEP
+    last = last * steps
     while len(tried):
         wider *= WIDER
         steps = difference_steps(problem, theta, free[tried], wider)
         far = linearise(problem, theta, start, free[tried], steps, lin.start)
-        changes, _ = projected(problem, far)
-        cosine = cosines(changes, last[:, tried])
+        changes = projected(problem, far)[0] * steps
+        cosine = cosines(changes - last[:, tried], last[:, tried])
         last[:, tried] = changes
+        is_first = wider == WIDER * STEP  # the smallest step will do
         better = cosine > alike[tried]
-        chosen = tried[better]
-        relative[chosen], alike[chosen] = wider, cosine[better]
-        lin.parameters[..., chosen] = far.parameters[..., better]
-        room = ROOM * _widths(problem, free[tried])
-        tried = tried[(cosine < ALIKE) & (WIDER * np.abs(steps) < room)]
+        alike[tried] = np.maximum(alike[tried], cosine)
+        better &= ~(is_first & (cosine >= ALIKE))
+        relative[tried[better]] = wider
+        lin.parameters[..., tried[better]] = far.parameters[..., better]
+        has_room = WIDER * np.abs(steps) < WIDEST * _widths(problem, free[tried])
+        tried = tried[(cosine < ALIKE) & has_room]
     return Differences(relative, alike >= ALIKE, lin)
 
 
@@ -86,14 +90,15 @@ def difference_steps(problem: Problem, theta: np.ndarray, columns, relative) -> 
     for j, size in zip(columns, np.broadcast_to(relative, len(columns)), strict=True):
         p = problem.simulator.slots[j].parameter
         step = size * max(p.scale, 0.1 * min(abs(theta[j] - p.nominal), abs(theta[j])))
+        step = min(step, WIDEST * (p.high - p.low))
         steps.append(step if theta[j] + step <= p.high else -step)
     return np.asarray(steps)
 
 
 def is_erratic(change: np.ndarray) -> bool:
-    """Say whether a perturbation changes few of the samples [M] much and most hardly."""
-    size = np.abs(change)
-    return bool(0 < ERRATIC * np.median(size) < np.sqrt(np.mean(size**2)))
+    """Say whether a perturbation, where it acts, changes few of the samples [M] much."""
+    size = np.abs(change[change != 0])
+    return bool(len(size) and ERRATIC * np.median(size) < np.sqrt(np.mean(size**2)))
 
 
 def projected(problem: Problem, lin: Linearisation) -> tuple[np.ndarray, np.ndarray]:
@@ -104,9 +109,9 @@ def projected(problem: Problem, lin: Linearisation) -> tuple[np.ndarray, np.ndar
 
 
 def cosines(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cosine of the angle between the lines along each column of two matrices, [k]."""
+    """Return the cosine of the angle between each column of two matrices, [k]."""
     size = np.linalg.norm(a, axis=0) * np.linalg.norm(b, axis=0)
-    return np.abs(np.sum(a * b, axis=0)) / np.maximum(size, 1e-300)
+    return np.sum(a * b, axis=0) / np.maximum(size, 1e-300)
 
 
 def _widths(problem: Problem, columns) -> np.ndarray:

@@ -37,15 +37,19 @@ from garat_jax.diagnosis.starts import (
 
 FITTED = 1e-4
 """Fall of the cost, relative to it, below which a fit has converged."""
+DESCENTS = 2
+"""Largest number of times that Gauss-Newton steps are begun; see `fit`."""
 STALLED = 3
-"""Steps in a row, none of which lowers the cost by `FITTED`, after which a fit across contacts has
-converged, too: initial states promise for ever what jumps do not let them keep."""
+"""Accepted steps in a row, none of which lowers the cost by `LITTLE`, after which a fit with wider
+differences has converged, too: initial states promise for ever what jumps do not let them keep."""
+LITTLE = 1e-3
+"""Fall of the cost, relative to it."""
 MOST_DAMPED = 1e4
 """Damping, relative to what the data say, from which a fit makes no further step."""
 SAME = 0.95
 """Cost with initial states sought anew, relative to that before, above which nothing is new."""
 WIDE = 0.5
-"""Finite difference where contacts are erratic, relative to a parameter's `scale` or size."""
+"""Finite difference where none is clear, relative to a parameter's `scale` or size."""
 WIDE_STEPS = 4
 """Largest number of Gauss-Newton steps with these."""
 SEARCHED = 12
@@ -78,8 +82,9 @@ def fit(
     """Fit some parameters within their bounds, and every initial state.
 
     Parameters see the fitted segments only. The initial states of those held out follow as long as
-    that lowers their own cost, and are settled at the end. Where contacts make derivatives erratic,
-    and more is left than noise, a search goes on from what Gauss-Newton steps have reached.
+    that lowers their own cost, and are settled at the end. Where no difference is clear of the
+    jumps of contacts, and more is left than noise, a search goes on from what Gauss-Newton steps
+    have reached.
 
     Args:
         problem: What is fitted.
@@ -87,32 +92,43 @@ def fit(
         start: Initial states to start from, [S, nq + nv].
         free: Indices of the parameters to fit.
         iterations: Largest number of Gauss-Newton steps, and again where initial states sought anew
-            lowered the cost.
+            lowered the cost, or wider differences are needed than were at first.
         rival: Cost on the fitted segments that another fit reached; steps that promise no more than
             `BEATEN` times that are not taken; beyond `SEARCHED_WITHIN` times there is no search.
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
     """
     theta, free = np.array(theta, float), tuple(free)
-    descend = partial(_descend, problem, free, iterations, rival)
-    near = clear_differences(problem, theta, start, free, sensitivity)
-    theta, start, lin, keep = descend(theta, start, near, sensitivity is not None)
-    descended = start
-    start, settled, again = _settle_all(problem, theta, descended, lin)
-    if again:
-        near = clear_differences(problem, theta, start, free, settled.start)
-        theta, descended, lin, keep = descend(theta, start, near, True)
-        start, settled, _ = _settle_all(problem, theta, descended, lin)
+    descents = 0
+    while True:
+        near = clear_differences(problem, theta, start, free, sensitivity)
+        theta, descended, lin = _descend(
+            problem, free, iterations, rival, theta, start, near, sensitivity is not None
+        )
+        start, settled, is_better = _settle_all(problem, theta, descended, lin)
+        there = _differences_there(problem, theta, descended, free, near.relative, lin)
+        sensitivity, descents = settled.start, descents + 1
+        is_wider = np.any(there.is_clear & (there.relative > near.relative))
+        if descents == DESCENTS or not (is_better or is_wider):
+            break
+    lin = there.linearisation
+    keep = _excited(problem, free, projected(problem, lin)[0])
     cost = np.sum(settled.residual[problem.fitted] ** 2)
-    if any(is_erratic(column) for column in projected(problem, lin)[0].T):
-        near = clear_differences(problem, theta, descended, free, lin.start)
-        lin = near.linearisation
-    if cost < SEARCHED_WITHIN * rival and not np.all(near.is_clear[keep]):
+    if cost < SEARCHED_WITHIN * rival and not np.all(there.is_clear[keep]):
         settled = settle(problem, theta, start)
-        found, lin, keep = _fit_across_contacts(problem, settled, free, near.relative)
+        found, lin, keep = _fit_across_contacts(problem, settled, there, free)
         theta, start, settled = found.theta, found.start, lin._replace(start=found.sensitivity)
     low, high = _interval(problem, theta, lin, free, keep)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
     return Fit(theta, free, frozen, start, settled.residual, settled.start, low, high)
+
+
+def _differences_there(
+    problem: Problem, theta, start, free, relative: np.ndarray, lin: Linearisation
+) -> Differences:
+    """Return the differences where a fit has come to: those that led there if they are smooth."""
+    if any(is_erratic(column) for column in projected(problem, lin)[0].T):
+        return clear_differences(problem, theta, start, free, lin.start)
+    return Differences(relative, np.ones(len(free), bool), lin)
 
 
 def _settle_all(problem: Problem, theta, start, lin: Linearisation):
@@ -132,7 +148,7 @@ def _wide(problem: Problem, near: Fit, free, relative) -> Linearisation:
     does not shrink with the perturbation; over a wide one these changes average out. What initial
     states do is in these sensitivities already: those to them are 0.
     """
-    steps = difference_steps(problem, near.theta, free, np.maximum(relative, WIDE))
+    steps = difference_steps(problem, near.theta, free, relative)
     thetas = np.tile(near.theta, (len(free), 1))
     thetas[np.arange(len(free)), list(free)] += steps
     moved = follow_each(problem, thetas, near)
@@ -141,18 +157,19 @@ def _wide(problem: Problem, near: Fit, free, relative) -> Linearisation:
     return Linearisation(near.residual, np.stack(columns, -1), nothing)
 
 
-def _fit_across_contacts(problem: Problem, near: Fit, free, relative):
+def _fit_across_contacts(problem: Problem, near: Fit, differences: Differences, free):
     """Search if more is left than noise, and take Gauss-Newton steps with `_wide` differences.
 
     Args:
         problem: What is fitted.
         near: What Gauss-Newton steps have reached, initial states settled.
+        differences: Those there; they are kept where they are wider than `WIDE`.
         free: Indices of the parameters to fit.
-        relative: Their finite differences; see `Differences`.
 
     Returns:
         The best that was reached, the linearisation there, and which parameters are excited.
     """
+    relative = np.maximum(differences.relative, WIDE)
     if _cost(problem, near) > SEARCHED_ABOVE * problem.expected[problem.fitted].sum():
         found = settle(problem, _search(problem, near, free, relative), near.start)
         near = min((near, found), key=partial(_cost, problem))
@@ -187,7 +204,7 @@ def _search(problem: Problem, near: Fit, free, relative) -> np.ndarray:
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SEARCHED)]
     problem, near = problem.take(chosen), near.take(chosen)
-    steps = difference_steps(problem, near.theta, free, np.maximum(relative, WIDE))
+    steps = difference_steps(problem, near.theta, free, relative)
     steps = np.abs(steps)
     least = FINEST * steps
     parameters = [problem.simulator.slots[j].parameter for j in free]
@@ -231,7 +248,7 @@ def _descend(
         is_stale: Whether their derivatives by the initial states are from elsewhere.
 
     Returns:
-        Parameters, initial states, the linearisation at them, and which parameters are excited.
+        Parameters, initial states and the linearisation at them.
     """
     damping, undamped, stalled = 1e-4, np.zeros(len(start)), 0
     patience = STALLED if np.any(near.relative > STEP) else iterations
@@ -240,9 +257,9 @@ def _descend(
         steps = difference_steps(problem, theta, free, near.relative)
         return linearise(problem, theta, start, free, steps, sensitivity)
 
-    lin, keep = near.linearisation, np.ones(len(free), bool)
+    lin = near.linearisation
     for taken in range(iterations):
-        change, keep = _parameter_step(problem, theta, lin, free, damping)
+        change, _ = _parameter_step(problem, theta, lin, free, damping)
         expected = lin.residual + lin.parameters @ change
         start_change = start_step(problem, lin, expected, undamped, 0.0)
         before = np.sum(lin.residual[problem.fitted] ** 2)
@@ -262,8 +279,8 @@ def _descend(
             starts = np.where(better[:, None], start, starts)
             trial = choose(better, stayed, trial)
             fall = before - np.sum(trial.residual[problem.fitted] ** 2)
-        stalled = 0 if fall > FITTED * before else stalled + 1
         if fall > 0:
+            stalled = 0 if fall > LITTLE * before else stalled + 1
             follows = np.sum(trial.residual**2, 1) < np.sum(lin.residual**2, 1)
             moved = problem.fitted | follows
             start = np.where(moved[:, None], starts, start)
@@ -274,7 +291,7 @@ def _descend(
             lin, is_stale = at(theta, start, None), False
         elif fall > 0:
             is_stale = True
-    return theta, start, lin, keep
+    return theta, start, lin
 
 
 def _excited(problem: Problem, free, sensitivity: np.ndarray) -> np.ndarray:
@@ -337,7 +354,9 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     differences = clear_differences(problem, theta, start, free)
     lin = differences.linearisation
     if not np.all(differences.is_clear[keep]):
-        lin = _wide(problem, fitted, free, differences.relative)
+        lin = _wide(
+            problem, fitted, free, np.where(differences.is_clear, differences.relative, WIDE)
+        )
     halved = problem.integrator_error(theta, start, fitted.residual)
     near = lin._replace(start=fitted.sensitivity)
     sensitivity, change = projected(problem, near._replace(residual=2.0 * halved))

@@ -80,7 +80,7 @@ class Outcome(NamedTuple):
         problem: The recordings, cut as long as the model with what was found can be followed.
         before: The model as it is, initial states settled.
         after: With all selected effects.
-        candidates: The first round's candidates, best first.
+        candidates: Those of the first round in which one passed, or of the first, best first.
         steps: The effects added, in order, each with the fit at the time.
         selected: The effects kept in the end, with their final parameters.
         floor: Noise floor of the metric on the held-out segments.
@@ -136,7 +136,8 @@ def explain(
         start: Initial states to start from, [S, nq + nv].
         say: Told what is being done.
         cut_longer: Cuts again for parameters with which the model can be followed for longer; see
-            `horizon.cut_longer`. A small effect that a large one hid may show only there.
+            `horizon.cut_longer`. A small effect may show only there, in a model that is adequate
+            within shorter segments or beside a large one.
     """
     before = settle(problem, problem.simulator.base, start)
     metric = make_metric(problem)
@@ -148,6 +149,7 @@ def explain(
         again = _go_on(found, *longer, say)
         if again is None:
             break
+        candidates = candidates if found.steps else again.candidates
         found = again
         before = settle(found.problem, found.problem.simulator.base, longer[1].start)
     problem, steps, current = found.problem, found.steps, found.fit
@@ -177,6 +179,8 @@ def _go_on(found: Selection, longer: Problem, settled: Fit, say) -> Selection | 
     say(f"following the recordings for {longer.horizon:.2g} s at a time")
     current = fit(longer, found.fit.theta, settled.start, found.fit.free)
     floor = noise_floor(longer, make_metric(longer), current)
+    if not is_above(longer, make_metric(longer), current, floor):
+        return None
     again = _select(longer, current, floor, found.steps, say)
     if {step.effect for step in again.steps} <= {step.effect for step in found.steps}:
         return None

@@ -126,9 +126,11 @@ def _measure(problem: Problem[Simulator], theta: np.ndarray, evidence: Evidence,
     larger = enlarge(simulator, rows, trials, changes, residual)
     if larger:
         found = change([row for row, _ in larger.values()])
-        jumps = cosines(found, changes[:, list(larger)]) < ALIKE
-        for (index, (row, trial)), new, jump in zip(larger.items(), found.T, jumps, strict=True):
-            if jump:
+        other = cosines(found, changes[:, list(larger)]) < ALIKE
+        for (index, (row, trial)), new, is_other in zip(
+            larger.items(), found.T, other, strict=True
+        ):
+            if is_other:
                 rows[index], trials[index], changes[:, index] = row, trial, new
     num_firsts = len(rows)
     rows, trials = others(simulator, theta, rows, best_sizes(trials, changes, residual))

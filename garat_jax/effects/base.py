@@ -240,8 +240,8 @@ class Effect(abc.ABC):
     def refined_from(cls, simpler: "Effect") -> Mapping[str, float]:
         """Return the parameters that are fitted first, and with which it is like a simpler law.
 
-        Screening may not see a law that shows beyond a threshold, and makes little of what two
-        directions differ by where it makes little of either. Without any, the law is left to it.
+        Screening may not see what a refinement adds: one with a threshold acts beyond it only. A
+        law without such parameters is left to screening.
 
         Args:
             simpler: An effect of a kind in `refines`, with values.

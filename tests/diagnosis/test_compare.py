@@ -111,7 +111,7 @@ def handmade(predicted, measured, weight) -> Replay:
     segments = Segments(
         measured=measured,
         weight=weight,
-        trust=np.ones_like(weight),
+        trust=np.ones_like(measured),
         start=empty,
         ctrl=empty,
         place=empty,
