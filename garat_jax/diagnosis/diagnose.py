@@ -18,7 +18,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
-from garat_jax.diagnosis.segments import QUIET, choose_grid
+from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -142,8 +142,8 @@ def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
 def metric_in_words(problem: Problem, how: str) -> str:
     """Say what the reported errors are; `how` names the recordings."""
     return (
-        f"root mean square of prediction error by signal's standard deviation, {QUIET:g} times its "
-        f"noise at least, {how}, segments of {problem.horizon:.2g} s"
+        "root mean square of prediction error by signal's standard deviation (a signal that hardly "
+        f"moves: by its noise, as a typical other), {how}, segments of {problem.horizon:.2g} s"
     )
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from garat_jax.diagnosis.problem import AnyProblem, Problem, StartSpace
-from garat_jax.diagnosis.segments import QUIET
+from garat_jax.diagnosis.segments import metric_spread
 from garat_jax.diagnosis.starts import Fit
 
 ABOVE_FLOOR = 1.5
@@ -22,8 +22,7 @@ class Metric(NamedTuple):
         weight: Squared metric of one squared whitened residual, [N].
         counted: Which residuals are samples and not padding, [S, N].
         trust: How much each counts in a fit and in decisions, [S, N].
-        spread: Standard deviation of each signal in the held-out data, `QUIET` times its noise at
-            least, [num_signals].
+        spread: What each signal's error is held against; see `segments.metric_spread`.
     """
 
     weight: np.ndarray
@@ -53,7 +52,7 @@ def make_metric(problem: Problem) -> Metric:
     """Make the metric: errors relative to each signal's spread in the held-out data."""
     s = problem.segments
     held_out = (s.weight > 0) & ~problem.fitted[:, None]
-    spread = np.maximum(s.measured[held_out].std(axis=0), QUIET * s.noise)
+    spread = metric_spread(s.measured[held_out], s.noise)
     weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
     num_signals = s.measured.shape[2]
     counted = np.repeat(s.weight > 0, num_signals, axis=1)

@@ -10,7 +10,7 @@ import numpy as np
 from garat_jax.diagnosis.measurements import Recording, estimate_velocity, signals
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.segments import QUIET, Grid, Segments, choose_grid, cut
+from garat_jax.diagnosis.segments import Grid, Segments, choose_grid, cut, metric_spread
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 
@@ -60,8 +60,7 @@ class Replay:
         """Return the part of some recordings, by number; spreads are those within them."""
         kept = np.isin(self.segments.recording, list(recordings))
         segments = self.segments.take(kept)
-        spread = segments.measured[segments.weight > 0].std(axis=0)
-        spread = np.maximum(spread, QUIET * segments.noise)
+        spread = metric_spread(segments.measured[segments.weight > 0], segments.noise)
         segments = dataclasses.replace(segments, spread=spread)
         return dataclasses.replace(self, segments=segments, predicted=self.predicted[kept])
 
@@ -118,9 +117,9 @@ def replay_with(
 
     Spreads, by which errors are told, are those within the recordings predicted.
     """
+    shown = range(len(recordings)) if chosen is None else list(chosen)
     segments = cut(recordings, grid, horizon)
-    if chosen is not None:
-        segments = segments.take(np.isin(segments.recording, list(chosen)))
+    segments = segments.take(np.isin(segments.recording, shown))
     sample = grid.interval * grid.per_sample
     everywhere = np.ones(len(segments.start), bool)
     problem = Problem(simulator, simulator, segments, everywhere, sample)
@@ -134,7 +133,7 @@ def replay_with(
         segments=segments,
         predicted=segments.measured + residual * segments.noise,
     )
-    return played if chosen is None else played.only(chosen)
+    return played.only(shown)
 
 
 def as_recordings(

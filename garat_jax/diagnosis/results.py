@@ -109,7 +109,7 @@ class Errors:
 
     Attributes:
         metric: How it is measured, the horizon among it.
-        unit: "1": relative to each signal's standard deviation, or to ten times its noise.
+        unit: "1": relative to each signal's standard deviation; see `segments.metric_spread`.
         before: Of the model as it is.
         after: With every selected effect.
         noise_floor: What noise and the integrator's own error make.

@@ -23,8 +23,9 @@ SMALLEST_NOISE = 1e-4
 UNKNOWN_NOISE = 1e-6
 """Noise assumed where no signal of a kind ever changes, in the signals' units."""
 QUIET = 10.0
-"""Multiple of its noise that a signal's spread counts as at least: a signal that hardly moves is
-predicted no better than its noise, which is no error of the model."""
+"""Multiple of its noise that a signal's spread counts as at least where a horizon is chosen; one
+that spreads less hardly moves: it is predicted no better than its noise, which is no error of the
+model."""
 KINEMATIC_WINDOWS = np.asarray([0.04, 0.06, 0.09, 0.13, 0.2, 0.3])
 """Seconds over which position and velocity sensors are held against each other."""
 HELD_AGAINST = 0.05
@@ -155,6 +156,23 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         spread=np.maximum(spread, QUIET * deviations),
         start_unit=_unit(start),
     )
+
+
+def metric_spread(samples: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return what the error of each signal is held against, [num_signals].
+
+    That is its standard deviation. Of a signal that hardly moves it is as many times its noise as
+    in the median of those that move (`QUIET` times if none does), so that its noise weighs no more
+    than theirs.
+
+    Args:
+        samples: Measurements, [num_samples, num_signals].
+        noise: Standard deviation of each signal's noise, [num_signals].
+    """
+    spread = samples.std(axis=0)
+    moves = spread > QUIET * noise
+    typical = np.median(spread[moves] / noise[moves]) if np.any(moves) else QUIET
+    return np.where(moves, spread, typical * noise)
 
 
 def _unit(start: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem, StartSpace
 from garat_jax.diagnosis.screen import cosine, screen
-from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, signal_noise
+from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, metric_spread, signal_noise
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.effects import ActuatorDelay
@@ -210,3 +210,14 @@ def test_a_signal_that_never_changes_has_the_noise_of_its_kind():
     assert segments.noise[2] == pytest.approx(1e-2, rel=0.2)
     np.testing.assert_array_equal(segments.noise[[1, 3]], segments.noise[[0, 2]])
     np.testing.assert_array_equal(segments.spread[[1, 3]], QUIET * segments.noise[[1, 3]])
+
+
+def test_noise_of_a_signal_that_hardly_moves_weighs_as_much_as_that_of_others():
+    rng = np.random.default_rng(0)
+    noise = np.asarray([1e-3, 1e-2, 0.1])
+    moves = np.column_stack([np.sin(9 * UNIFORM), 9 * np.cos(9 * UNIFORM), 0 * UNIFORM])
+    samples = moves + noise * rng.normal(size=moves.shape)
+    spread = metric_spread(samples, noise)
+    np.testing.assert_array_equal(spread[:2], samples[:, :2].std(axis=0))
+    assert spread[2] / noise[2] == pytest.approx(np.median(spread[:2] / noise[:2]))
+    np.testing.assert_allclose(metric_spread(samples[:, 2:], noise[2:]), QUIET * noise[2:])
