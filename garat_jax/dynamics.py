@@ -216,6 +216,22 @@ def move(
     return jax.lax.scan(substep, state, length=num_substeps)[0]
 
 
+def hold(
+    dynamics: Dynamics, state: PhysicsState, ctrl: jax.Array, num_substeps: int = 1
+) -> PhysicsState:
+    """Do a `step` in which the mechanism stays where it is, with the velocity that it has.
+
+    Commands that are late get under way, actuators are activated and sensors note.
+    """
+    if dynamics.host.model.na:
+        moved = move(dynamics, state, ctrl, num_substeps)
+        held = moved._replace(time=state.time, qpos=state.qpos, qvel=state.qvel)
+    else:
+        *_, memory = _commands(dynamics, view(dynamics), state, state.memory, ctrl, num_substeps)
+        held = state._replace(memory=memory)
+    return note(dynamics, held, num_substeps * dynamics.timestep)
+
+
 def steps_at_once(dynamics: Dynamics) -> bool:
     """Say whether one call can take many steps: nothing looks at the state on the way."""
     if dynamics.engine != "mujoco" or dynamics.host.model.na:

@@ -5,8 +5,9 @@ import contextlib
 import functools
 import hashlib
 import logging
+import math
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +19,9 @@ from garat_jax import host_call
 from garat_jax.errors import UserError
 from garat_jax.setconst import CONSTANT_INPUTS
 
-STATE_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")
 KEPT_BATCHES = 16
 """Batches of simulations, of all models together, that are kept for the next call."""
-INPUTS = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
+INPUTS = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 
 UNSTABLE = tuple(f"Nan, Inf or huge value in {name}" for name in ("QPOS", "QVEL", "QACC"))
 """How warnings begin of which callers see the consequence: a state that is not finite."""
@@ -34,7 +34,7 @@ _warned: set[str] = set()
 if mujoco.get_mju_user_warning() is None:
     mujoco.set_mju_user_warning(_warnings.append)
 
-_idle: list[tuple[tuple, Batch]] = []
+_idle: list[tuple[tuple, "_Simulations"]] = []
 """Simulations that no call uses now, those used last at the end; scratch space without a state."""
 _idle_lock = threading.Lock()
 
@@ -62,7 +62,7 @@ class HostModel:
 
     @functools.cached_property
     def sizes(self) -> tuple[int, ...]:
-        """Lengths of the state's parts in a row: `STATE_FIELDS`, then sensor data."""
+        """Lengths of a row's parts: time, qpos, qvel, act, qacc_warmstart, then sensor data."""
         m = self.model
         return (1, m.nq, m.nv, m.na, m.nv, m.nsensordata)
 
@@ -114,65 +114,68 @@ class HostModel:
         dtype = str(row.dtype)
         result = host_call.call(
             " ".join((self._digest, name, dtype, *inputs)),
-            functools.partial(self._on_host, function, dtype, tuple(inputs)),
+            functools.partial(self._on_host, function, dtype, tuple(fields)),
             int(np.prod(shape)) * (row.dtype.itemsize // 4),
             [_to_words(value.astype(row.dtype)) for value in inputs.values()],
         )
         return _from_words(result, row.dtype).reshape(shape)
 
     def _on_host(self, function, dtype: str, names: tuple[str, ...], words) -> np.ndarray:
-        fields = {
-            name: np.ascontiguousarray(value).view(dtype)
-            for name, value in zip(names, words, strict=True)
-        }
-        row, control = fields.pop("row"), fields.pop("control")
-        control = control.reshape(*control.shape[:-1], -1, self.model.nu + self.model.nv)
-        shapes = {name: _field_shape(self.model, name) for name in fields}
-        fields = {name: v.reshape(*v.shape[:-1], *shapes[name]) for name, v in fields.items()}
-        leading = np.broadcast_shapes(
-            row.shape[:-1],
-            control.shape[:-2],
-            *(value.shape[: value.ndim - len(shapes[name])] for name, value in fields.items()),
-        )
-        num = int(np.prod(leading, dtype=int))
-        with self._batch(num, frozenset(fields)) as batch:
-            _write_fields(batch, fields, shapes, leading)
-            rows = np.broadcast_to(row, leading + row.shape[-1:]).reshape(num, -1)
-            _write_state(batch, rows)
-            controls = np.broadcast_to(control, leading + control.shape[-2:])
-            result = function(batch, controls.reshape(num, *control.shape[-2:]), _finite(rows))
+        """Write states and fields of a batch, call a function of it, and return its result.
+
+        A program may call this for every physics substep of a few simulations, which take less
+        time than a dozen lines of Python.
+        """
+        rows, controls, *values = (np.ascontiguousarray(value).view(dtype) for value in words)
+        leading = np.broadcast_shapes(*(value.shape[:-1] for value in words))
+        num = math.prod(leading)
+        rows = np.broadcast_to(rows, leading + rows.shape[-1:]).reshape(num, -1)
+        controls = np.broadcast_to(controls, leading + controls.shape[-1:])
+        controls = controls.reshape(num, -1, self.model.nu + self.model.nv)
+        with self._simulations(num, names) as simulations:
+            simulations.write_fields(values, leading)
+            simulations.state[:] = rows
+            finite = np.isfinite(rows)
+            ids = None if finite.all() else np.flatnonzero(finite.all(axis=1))
+            result = function(simulations, controls, ids)
             _log_warnings()
-            with np.errstate(over="ignore"):  # what exploded is infinite in 32 bits
-                result = result.astype(row.dtype)
+            if result.dtype != rows.dtype:
+                with np.errstate(over="ignore"):  # what exploded is infinite in 32 bits
+                    result = result.astype(rows.dtype)
         return result.reshape(*leading, -1).view(np.uint32)
 
-    def _advance_batch(self, num_substeps: int, batch: Batch, controls, ids) -> np.ndarray:
+    def _advance_batch(
+        self, num_substeps: int, simulations: "_Simulations", controls: np.ndarray, ids
+    ) -> np.ndarray:
         """Step a batch under controls [num, substeps or 1, nu + nv]; return its rows.
 
         Simulations not in `ids`, unless that is None for all, stay as they are.
         """
         if controls.shape[1] == 1:
-            nu = self.model.nu
-            batch.bind("ctrl")[:] = controls[:, 0, :nu]
-            batch.bind("qfrc_applied")[:] = controls[:, 0, nu:]
-            batch.step(ids, nstep=num_substeps)
+            simulations.inputs[:] = controls[:, 0]
+            simulations.batch.step(ids, nstep=num_substeps)
         else:
             chosen = controls if ids is None else controls[ids]
-            batch.rollout(num_substeps, chosen, int(INPUTS), record=(), ids=ids)
-        num = len(controls)
-        parts = [batch.bind(name).reshape(num, -1) for name in (*STATE_FIELDS, "sensordata")]
-        return np.concatenate(parts, axis=1)
+            simulations.batch.rollout(num_substeps, chosen, INPUTS, record=(), ids=ids)
+        return np.concatenate([simulations.state, simulations.sensors], axis=1)
 
-    def _trace_batch(self, num_substeps: int, repeat: int, batch: Batch, controls, ids):
+    def _trace_batch(
+        self,
+        num_substeps: int,
+        repeat: int,
+        simulations: "_Simulations",
+        controls: np.ndarray,
+        ids,
+    ) -> np.ndarray:
         """Step a batch under controls [num, .., nu + nv], each held for `repeat` substeps.
 
         MuJoCo stops a simulation that diverges and repeats its last state; here it is NaN.
         """
-        num, length = len(controls), controls.shape[1] * repeat
+        batch, num, length = simulations.batch, len(controls), controls.shape[1] * repeat
         chosen = np.repeat(controls if ids is None else controls[ids], repeat, axis=1)
-        time = batch.bind("time").reshape(-1)
+        time = simulations.state[:, 0]
         end = time + (length - 0.5) * self.model.opt.timestep
-        found = batch.rollout(length, chosen, int(INPUTS), record=("qpos", "qvel"), ids=ids)
+        found = batch.rollout(length, chosen, INPUTS, record=("qpos", "qvel"), ids=ids)
         moved = np.concatenate([found["qpos"], found["qvel"]], axis=2)
         path = np.full((num, length // num_substeps, moved.shape[2]), np.nan)
         path[slice(None) if ids is None else ids] = moved[:, num_substeps - 1 :: num_substeps]
@@ -180,19 +183,51 @@ class HostModel:
         return path
 
     @contextlib.contextmanager
-    def _batch(self, num: int, fields: frozenset[str]) -> Iterator[Batch]:
+    def _simulations(self, num: int, fields: tuple[str, ...]) -> Iterator["_Simulations"]:
         """Lend simulations for a batch size; each set of changed fields has its own."""
         key = (self._digest, num, fields)
         with _idle_lock:
             found = [index for index, (kept, _) in enumerate(_idle) if kept == key]
-            batch = _idle.pop(found[-1])[1] if found else None
-        if batch is None:
-            batch = Batch(self.model, num)
-            batch.bind("sensordata")
-        yield batch
+            simulations = _idle.pop(found[-1])[1] if found else None
+        simulations = simulations or _Simulations(self.model, num, fields)
+        yield simulations
         with _idle_lock:
-            _idle.append((key, batch))
+            _idle.append((key, simulations))
             del _idle[:-KEPT_BATCHES]
+
+
+class _Simulations:
+    """A batch, and what of it is written and read in each call.
+
+    MuJoCo's rows of state begin with the parts that `HostModel.sizes` lists, less the sensor data;
+    of native delays, which would lie between, there is none. Controls follow, and forces.
+
+    Attributes:
+        batch: The simulations.
+        state: Their state, [num, .].
+        inputs: Controls and generalised forces, [num, nu + nv].
+        sensors: Their sensor data, [num, nsensordata].
+        fields: The model's fields that differ between them, by name.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num: int, fields: tuple[str, ...]):
+        self.batch = Batch(model, num)
+        size = 1 + model.nq + model.nv + model.na + model.nv
+        self.state = self.batch.state[:, :size]
+        self.inputs = self.batch.state[:, size : size + model.nu + model.nv]
+        self.sensors = self.batch.bind("sensordata").reshape(num, -1)
+        self.fields = {name: self.batch.expand(name) for name in fields}
+
+    def write_fields(self, values: Sequence[np.ndarray], leading: tuple[int, ...]) -> None:
+        """Write the fields [.., n] and recompute what derives from those that changed."""
+        stale = False
+        for (name, held), value in zip(self.fields.items(), values, strict=True):
+            value = np.broadcast_to(value, leading + value.shape[-1:]).reshape(held.shape)
+            if not np.array_equal(held, value):
+                held[...] = value
+                stale = stale or name in CONSTANT_INPUTS
+        if stale:
+            self.batch.set_const()
 
 
 def _log_warnings() -> None:
@@ -219,35 +254,3 @@ def _from_words(words: jax.Array, dtype) -> jax.Array:
     if jnp.dtype(dtype).itemsize == 8:
         words = words.reshape(-1, 2)
     return jax.lax.bitcast_convert_type(words, dtype)
-
-
-def _field_shape(model: mujoco.MjModel, name: str) -> tuple[int, ...]:
-    owner, _, field = name.rpartition(".")
-    return np.shape(getattr(model.opt if owner else model, field))
-
-
-def _write_fields(batch: Batch, fields, shapes, leading) -> None:
-    """Write per-simulation fields and recompute what derives from those that changed."""
-    stale = False
-    for name, value in fields.items():
-        values = np.broadcast_to(value, leading + shapes[name]).reshape(-1, *shapes[name])
-        held = batch.expand(name)
-        if not np.array_equal(held, values):
-            held[...] = values
-            stale = stale or name in CONSTANT_INPUTS
-    if stale:
-        batch.set_const()
-
-
-def _finite(rows: np.ndarray) -> np.ndarray | None:
-    """Return which simulations have a finite state [num, ..], None if all have."""
-    finite = np.isfinite(rows).all(axis=1)
-    return None if finite.all() else np.flatnonzero(finite)
-
-
-def _write_state(batch: Batch, rows: np.ndarray) -> None:
-    start = 0
-    for name in STATE_FIELDS:
-        view = batch.bind(name).reshape(len(rows), -1)
-        view[...] = rows[:, start : start + view.shape[1]]
-        start += view.shape[1]

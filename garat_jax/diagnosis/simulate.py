@@ -309,24 +309,23 @@ class Simulator:
         def whole(state):
             return jnp.concatenate([state.qpos, state.qvel])
 
-        def advance(state, inputs):
-            index, command = inputs
-            if self._transform is not None:
-                command = self._transform(whole(dynamics.sensed(world, state)), command)
-            moved = dynamics.move(world, state, command, self._substeps)
-            held = index < self._warm_up
-            moved = moved._replace(
-                qpos=jnp.where(held, state.qpos, moved.qpos),
-                qvel=jnp.where(held, state.qvel, moved.qvel),
-            )
-            moved = dynamics.note(world, moved, self._substeps * world.timestep)
-            return moved, (whole(dynamics.sensed(world, moved)), whole(moved))
+        def commanded(state, command):
+            if self._transform is None:
+                return command
+            return self._transform(whole(dynamics.sensed(world, state)), command)
 
-        _, paths = jax.lax.scan(advance, state, (jnp.arange(len(ctrl)), ctrl))
+        def hold(state, command):
+            return dynamics.hold(world, state, commanded(state, command), self._substeps), None
+
+        def advance(state, command):
+            state = dynamics.step(world, state, commanded(state, command), self._substeps)
+            return state, (whole(dynamics.sensed(world, state)), whole(state))
+
+        state, _ = jax.lax.scan(hold, state, ctrl[: self._warm_up])
+        _, paths = jax.lax.scan(advance, state, ctrl[self._warm_up :])
         firsts = (whole(dynamics.sensed(world, state)), whole(state))
         signals, true = (
-            jnp.concatenate([first[None], path[self._warm_up :]])
-            for first, path in zip(firsts, paths, strict=True)
+            jnp.concatenate([first[None], path]) for first, path in zip(firsts, paths, strict=True)
         )
         return self._at_samples(signals, place), true
 
