@@ -212,27 +212,6 @@ def test_a_delay_of_whole_control_steps_shifts_the_command():
     np.testing.assert_allclose(states[-1].qpos, reference.qpos, rtol=1e-12)
 
 
-def test_while_a_mechanism_is_held_late_commands_get_under_way():
-    late = compiled(PENDULUM, ActuatorDelay("all", delay=0.012), engine="mujoco")
-    start = dynamics.initial_state(late, jnp.asarray([0.4]), jnp.asarray([-1.0]))
-    held = dynamics.hold(late, start, jnp.asarray([2.0]), 6)  # of 2 ms each
-    np.testing.assert_array_equal(held.qpos, start.qpos)
-    np.testing.assert_array_equal(held.qvel, start.qvel)
-    moved = dynamics.step(late, held, jnp.asarray([0.0]), 6)
-    plain = compiled(PENDULUM, engine="mujoco")
-    reference = dynamics.initial_state(plain, start.qpos, start.qvel)
-    reference = dynamics.step(plain, reference, jnp.asarray([2.0]), 6)
-    np.testing.assert_allclose(moved.qpos, reference.qpos, rtol=1e-12)
-
-
-def test_while_a_mechanism_is_held_its_muscles_are_activated():
-    world = compiled(MUSCLE, engine="mujoco")
-    start = dynamics.initial_state(world, jnp.asarray([0.1, 0.2]), jnp.zeros(2))
-    held = dynamics.hold(world, start, jnp.ones(world.host.model.nu), 10)
-    np.testing.assert_array_equal(held.qpos, start.qpos)
-    assert np.all(held.act > 0.1)
-
-
 def test_friction_takes_energy_away():
     decay = [
         np.abs(simulate(compiled(PENDULUM, make_hinge(kind, size), engine="mujoco"), 200)[-50:, 1])

@@ -9,6 +9,7 @@ import numpy as np
 from garat_jax.diagnosis.diagnose import thin
 from garat_jax.diagnosis.fit import count_timestep, fit
 from garat_jax.diagnosis.horizon import choose_horizon
+from garat_jax.diagnosis.localise import missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
@@ -17,6 +18,8 @@ from garat_jax.diagnosis.results import Estimate
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit, settle
+from garat_jax.diagnosis.suggest import suggest
+from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect, unit_at
 from garat_jax.errors import UserError, choose
 
@@ -102,7 +105,8 @@ def size(
         UserError: Nothing is left to fit.
     """
     recordings = thin(recordings)
-    grid = choose_grid(recordings, model.compile(engine="mujoco").host.model.opt.timestep)
+    host = native_model(model.compile(engine="mujoco"))
+    grid = choose_grid(recordings, host.opt.timestep)
     simulator = Simulator(model, (effect,), grid)
     free = [j for j, slot in enumerate(simulator.slots) if slot.parameter.name not in given]
     if not free:
@@ -114,6 +118,7 @@ def size(
         segments,
         np.ones(len(segments.start), bool),
         grid.interval * grid.per_sample,
+        suggest((effect,), missing_torque(host, recordings)),
     )
     metric = make_metric(dataclasses.replace(problem, fitted=~problem.fitted))
     before = settle(problem, simulator.base, segments.start)
@@ -144,7 +149,10 @@ def _best_fit(problem: Problem, before: Fit, effect: Effect, given, free) -> Fit
     """Fit from every size at which the effect should be tried; return the best."""
     simulator = problem.simulator
     fits = []
-    for sizes in type(effect).starts(simulator.host, effect.target):
+    starts = type(effect).starts(simulator.host, effect.target)
+    for suggestion in problem.suggested.values():
+        starts += suggestion.starts
+    for sizes in starts:
         theta = before.theta.copy()
         for j, slot in enumerate(simulator.slots):
             if slot.parameter.name in sizes and slot.parameter.name not in given:

@@ -22,6 +22,7 @@ from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.suggest import suggest
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
 from garat_jax.provenance import versions
@@ -64,7 +65,9 @@ def diagnose(
         for refine in (1, 2)
     )
     sample = grid.interval * grid.per_sample
-    problem = Problem(simulator, finer, segments, segments.recording < len(fitted), sample)
+    suggested = suggest(simulator.effects, missing_torque(host, fitted))
+    seen = segments.recording < len(fitted)
+    problem = Problem(simulator, finer, segments, seen, sample, suggested)
     say("the model as it is")
     settled = settle(problem, simulator.base, segments.start)
     problem = trusted(problem, settled)

@@ -6,7 +6,7 @@ batched simulation.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import mujoco
@@ -14,7 +14,7 @@ import numpy as np
 
 from garat_jax.diagnosis.segments import Segments
 from garat_jax.diagnosis.simulate import Slot
-from garat_jax.effects import Effect
+from garat_jax.effects import Effect, Suggestion
 
 BLOCK = 0.25
 """Seconds of the shortest block within which errors may be correlated, in robust variances."""
@@ -71,6 +71,7 @@ class Problem(Generic[AnySimulator]):
         segments: All segments, those held out among them.
         fitted: Which segments the parameters may see, [S] bool.
         interval: Seconds between samples.
+        suggested: Sizes at which to try candidates besides those that are always tried, by index.
     """
 
     simulator: AnySimulator
@@ -78,6 +79,7 @@ class Problem(Generic[AnySimulator]):
     segments: Segments
     fitted: np.ndarray
     interval: float
+    suggested: Mapping[int, Suggestion] = dataclasses.field(default_factory=dict)
 
     @property
     def horizon(self) -> float:

@@ -280,8 +280,10 @@ def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:
 
 def _num_tried(problem: Problem, scores: Sequence[Score]) -> int:
     """Return how many sizes of candidates were tried."""
-    tried = (problem.simulator.effects[score.effect] for score in scores if not score.excluded)
-    return sum(len(effect.starts(problem.simulator.host, effect.target)) for effect in tried)
+    tried = [score.effect for score in scores if not score.excluded]
+    effects = (problem.simulator.effects[index] for index in tried)
+    listed = sum(len(effect.starts(problem.simulator.host, effect.target)) for effect in effects)
+    return listed + sum(problem.suggested[i].num_tried for i in tried if i in problem.suggested)
 
 
 def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):

@@ -121,7 +121,7 @@ def _measure(problem: Problem[Simulator], theta: np.ndarray, evidence: Evidence,
             moved[list(row.values)] = list(row.values.values())
         return evidence.change(thetas)
 
-    rows, trials = firsts(simulator, theta, skip)
+    rows, trials = firsts(problem, theta, skip)
     changes = change(rows)
     larger = enlarge(simulator, rows, trials, changes, residual)
     if larger:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from garat_jax.diagnosis.differences import is_erratic
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.simulate import Simulator, columns_of
-from garat_jax.effects import Effect
 
 ROOM = 0.3
 """Share of the way to a bound that a step is enlarged to at most."""
@@ -44,16 +44,17 @@ class Trial(NamedTuple):
     is_only: bool
 
 
-def firsts(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[Row], list[Trial]]:
+def firsts(problem: Problem[Simulator], theta: np.ndarray, skip) -> tuple[list[Row], list[Trial]]:
     """List each candidate at each of its sizes, a row for each."""
+    simulator = problem.simulator
     rows: list[Row] = []
     trials = []
-    for index, effect in enumerate(simulator.effects):
+    for index in range(len(simulator.effects)):
         names = columns_of(simulator.slots, index)
         columns = list(names.values())
         if index in skip or not columns:
             continue
-        starts = _sizes(simulator, theta, effect, columns)
+        starts = _sizes(problem, theta, index, columns)
         for given in starts:
             start = {names[name]: value for name, value in given.items()}
             if len(starts) == 1 and len(start) == 1:
@@ -65,13 +66,18 @@ def firsts(simulator: Simulator, theta: np.ndarray, skip) -> tuple[list[Row], li
     return rows, trials
 
 
-def _sizes(simulator: Simulator, theta: np.ndarray, effect: Effect, columns: list[int]):
+def _sizes(problem: Problem[Simulator], theta: np.ndarray, index: int, columns: list[int]):
     """Return the sizes at which to try an effect; half and twice its size where it acts already."""
+    simulator = problem.simulator
+    effect = simulator.effects[index]
     starts = effect.starts(simulator.host, effect.target)
     none = effect.at(simulator.host, effect.target)
     slots = [simulator.slots[j].parameter for j in columns]
     acts = any(theta[j] != none[p.name] for j, p in zip(columns, slots, strict=True))
-    if len(starts) == 1 or not acts:
+    if not acts:
+        suggestion = problem.suggested.get(index)
+        return starts if suggestion is None else (*starts, *suggestion.starts)
+    if len(starts) == 1:
         return starts
     first, size = slots[0], float(theta[columns[0]])
     return tuple({first.name: min(factor * size, first.high)} for factor in (0.5, 2.0))

@@ -1,7 +1,7 @@
 """The catalogue of physical effects."""
 
 from garat_jax.effects.actuator import BackEmf, MotorCurve, MotorGain, TorqueSaturation
-from garat_jax.effects.base import Effect, ModelView, Parameter, parameter, unit_at
+from garat_jax.effects.base import Effect, ModelView, Parameter, Suggestion, parameter, unit_at
 from garat_jax.effects.body import AirDrag, ComOffset, PayloadMass
 from garat_jax.effects.command import ActuatorDelay, ActuatorLag, MotorDeadband
 from garat_jax.effects.contact import ContactCompliance, ContactFriction
@@ -82,6 +82,7 @@ __all__ = [
     "RotorInertia",
     "SensorDelay",
     "StribeckFriction",
+    "Suggestion",
     "TorqueOffset",
     "TorqueSaturation",
     "ViscousDamping",

@@ -37,6 +37,18 @@ class Parameter(NamedTuple):
     source: str
 
 
+class Suggestion(NamedTuple):
+    """Sizes at which an effect should be tried.
+
+    Attributes:
+        starts: Values of its parameters, by name.
+        num_tried: How many sizes that are not alike were looked at to find them.
+    """
+
+    starts: tuple[Mapping[str, float], ...]
+    num_tried: int
+
+
 def parameter(
     nominal: float, *, unit: str, low: float, high: float, scale: float, source: str
 ) -> Any:
@@ -235,6 +247,19 @@ class Effect(abc.ABC):
         """
         first = cls.parameters()[0]
         return ({first.name: cls.at(host, target)[first.name] + first.scale},)
+
+    @classmethod
+    def suggested(cls, position: np.ndarray, torque: np.ndarray) -> Suggestion | None:
+        """Return sizes that the torque missing at its joint suggests, None if there are none.
+
+        For laws with so many shapes that `starts` cannot list them.
+
+        Args:
+            position: Where the joint was measured, [M].
+            torque: What the model lacks there, [M].
+        """
+        del position, torque
+        return None
 
     @classmethod
     def refined_from(cls, simpler: "Effect") -> Mapping[str, float]:

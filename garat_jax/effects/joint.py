@@ -1,5 +1,6 @@
 """Effects at a joint beside friction: inertia, constant torque, spring, cogging."""
 
+import math
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -8,10 +9,20 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
+from scipy import signal
 
 from garat_jax.effects.actuator import can_bias, make_affine
 from garat_jax.effects.at_joint import at_dof
-from garat_jax.effects.base import Effect, ModelView, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+
+BINS_PER_PERIOD = 2
+"""Bins of the angle in half of the shortest period of a ripple."""
+MOST_BINS = 2**20
+"""Bins of the angle at most; a joint that turns for long shows no shorter periods than these do."""
+FINER = 4
+"""Points of the spectrum for each that the range of the angle resolves."""
+PEAKS = 4
+"""Ripples that are suggested: noise of fast motion may stand out more than a small one."""
 
 
 @struct.dataclass
@@ -204,9 +215,35 @@ class CoggingTorque(Effect):
             for phase in (0.0, np.pi / 2)
         )
 
+    @classmethod
+    def suggested(cls, position: np.ndarray, torque: np.ndarray) -> Suggestion | None:
+        """Return the ripples that stand out of the missing torque's spectrum over the angle."""
+        span = float(np.ptp(position))
+        periods = next(p for p in cls.parameters() if p.name == "periods")
+        low, high = max(periods.low, 2 * np.pi / max(span, 1e-9)), periods.high
+        if low >= high:
+            return None
+        width = max(np.pi / (BINS_PER_PERIOD * high), span / MOST_BINS)
+        sums = np.bincount(((position - position.min()) / width).astype(int), torque)
+        size = FINER * len(sums)
+        spectrum = np.abs(np.fft.rfft(sums, size))
+        at = 2 * np.pi * np.arange(len(spectrum)) / (size * width)
+        peaks = signal.find_peaks(spectrum * ((at >= low) & (at <= high)))[0]
+        peaks = peaks[np.argsort(-spectrum[peaks])][:PEAKS]
+        starts = tuple(_wave(float(at[peak]), position, torque) for peak in peaks)
+        return Suggestion(starts, math.ceil((high - low) * span / (2 * np.pi)))
+
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
         """Add the torque at the present angle."""
         joint = element_id(model.host, "joint", self.name)
         angle = state.qpos[model.host.jnt_qposadr[joint]]
         torque = self.amplitude * jnp.sin(self.periods * angle + self.phase)
         return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
+
+
+def _wave(periods: float, position: np.ndarray, torque: np.ndarray) -> dict[str, float]:
+    """Return the ripple with some periods that is most like a torque."""
+    waves = np.stack([np.sin(periods * position), np.cos(periods * position)], axis=1)
+    sine, cosine = np.linalg.lstsq(waves, torque, rcond=None)[0]
+    phase = float(np.arctan2(cosine, sine))
+    return {"amplitude": float(np.hypot(sine, cosine)), "periods": periods, "phase": phase}

@@ -18,6 +18,7 @@ def record(
     seed: int,
     pull: float = 0.0,
     torque: Callable[[float], float] = lambda speed: 0.0,
+    ripple: Callable[[float], float] = lambda angle: 0.0,
 ) -> Recording:
     """Record a pendulum that differs from the model, and at which a cable pulls [N m].
 
@@ -26,6 +27,7 @@ def record(
         seed: Draws commands and noise.
         pull: A constant torque.
         torque: One more torque [N m] by the speed [rad/s].
+        ripple: And one by the angle [rad].
     """
     rng = np.random.default_rng(seed)
     spec = models.spec(models.PENDULUM)
@@ -40,7 +42,7 @@ def record(
         states.append([data.qpos[0], data.qvel[0]])
         data.ctrl[0] = command
         for _ in range(round(0.004 / model.opt.timestep)):
-            data.qfrc_applied[0] = pull + torque(data.qvel[0])
+            data.qfrc_applied[0] = pull + torque(data.qvel[0]) + ripple(data.qpos[0])
             mujoco.mj_step(model, data)
     states = np.asarray(states) + 1e-3 * rng.normal(size=(len(TIME), 2)) * [1.0, 10.0]
     return Recording(

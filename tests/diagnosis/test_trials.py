@@ -24,8 +24,9 @@ class Jumping:
 
 
 def test_steps_grow_where_few_samples_make_the_change():
-    simulator = make_problem([record(UNIFORM)], candidates()).simulator
-    rows, trials = firsts(simulator, simulator.base, ())
+    problem = make_problem([record(UNIFORM)], candidates())
+    simulator = problem.simulator
+    rows, trials = firsts(problem, simulator.base, ())
     damping, friction = (
         next(
             t.rows[0]

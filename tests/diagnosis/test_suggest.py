@@ -1,0 +1,53 @@
+"""Sizes to try that the missing torque suggests."""
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.diagnose import diagnose
+from garat_jax.diagnosis.localise import missing_torque
+from garat_jax.diagnosis.suggest import suggest
+from garat_jax.effects import CoggingTorque, ViscousDamping
+from tests.diagnosis.pendulum import MODEL, add_damping, record
+
+HOST = MODEL.spec.copy().compile()
+COGGING = CoggingTorque("joint/hinge")
+
+
+@pytest.mark.parametrize("periods", [1.5, 17.3, 42.0, 168.0])
+def test_any_number_of_periods_stands_out_of_the_spectrum(periods):
+    rng = np.random.default_rng(0)
+    angle = np.concatenate([np.linspace(-2, 3, 3000), 3 - 4 * np.linspace(0, 1, 2000) ** 2])
+    torque = 0.3 * np.sin(periods * angle - 1.2) + 0.3 * rng.normal(size=len(angle))
+    start = CoggingTorque.suggested(angle, torque).starts[0]
+    assert start["periods"] == pytest.approx(periods, abs=0.15)
+    assert start["amplitude"] == pytest.approx(0.3, rel=0.15)
+    wave = np.sin(start["periods"] * angle + start["phase"])
+    assert np.corrcoef(wave, np.sin(periods * angle - 1.2))[0, 1] > 0.9
+
+
+def test_a_joint_that_hardly_moves_suggests_nothing():
+    still = 1.0 + 1e-3 * np.sin(np.arange(1000.0))
+    assert CoggingTorque.suggested(still, np.sin(100 * still)) is None
+    assert CoggingTorque.suggested(np.full(10, 0.3), np.ones(10)) is None
+
+
+def test_a_ripple_is_suggested_beside_friction_and_only_to_the_law_that_asks():
+    def rippled(seed):
+        return record(add_damping, seed, ripple=lambda angle: 0.03 * np.sin(11 * angle + 0.4))
+
+    missing = missing_torque(HOST, [rippled(seed) for seed in (0, 1)])
+    found = suggest([ViscousDamping("joint/hinge"), COGGING], missing)
+    assert list(found) == [1]
+    assert min(abs(start["periods"] - 11) for start in found[1].starts) < 0.3
+    assert found[1].num_tried > 100
+
+
+def test_a_ripple_with_an_uncommon_number_of_periods_is_found():
+    def rippled(seed):
+        return record(lambda spec: None, seed, ripple=lambda angle: 0.1 * np.sin(17 * angle + 1))
+
+    found = diagnose(MODEL, [rippled(seed) for seed in (0, 1, 2)], [rippled(3)])
+    (ripple,) = found.selected
+    assert ripple.effect == "cogging_torque"
+    assert ripple.parameters["periods"].estimate == pytest.approx(17, rel=0.01)
+    assert ripple.parameters["amplitude"].estimate == pytest.approx(0.1, rel=0.05)
