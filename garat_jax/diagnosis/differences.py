@@ -62,7 +62,7 @@ def clear_differences(
     while len(tried):
         wider *= WIDER
         steps = difference_steps(problem, theta, free[tried], wider)
-        far = linearise(problem, theta, start, free[tried], steps, lin.start)
+        far = linearise(problem, theta, start, free[tried], steps, lin.start, lin.residual)
         changes = projected(problem, far)[0] * steps
         cosine = cosines(changes - last[:, tried], last[:, tried])
         last[:, tried] = changes

@@ -98,18 +98,17 @@ def fit(
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
     """
     theta, free = np.array(theta, float), tuple(free)
-    descents = 0
+    there = clear_differences(problem, theta, start, free, sensitivity)
+    is_stale, descents = sensitivity is not None, 0
     while True:
-        near = clear_differences(problem, theta, start, free, sensitivity)
-        theta, descended, lin = _descend(
-            problem, free, iterations, rival, theta, start, near, sensitivity is not None
-        )
-        start, settled, is_better = _settle_all(problem, theta, descended, lin)
-        there = _differences_there(problem, theta, descended, free, near.relative, lin)
-        sensitivity, descents = settled.start, descents + 1
+        near, descents = there, descents + 1
+        theta, start, lin = _descend(problem, free, iterations, rival, theta, start, near, is_stale)
+        start, settled, is_better = _settle_all(problem, theta, start, lin)
+        there = _differences_there(problem, theta, start, free, near.relative, lin, settled)
         is_wider = np.any(there.is_clear & (there.relative > near.relative))
         if descents == DESCENTS or not (is_better or is_wider):
             break
+        is_stale = True
     lin = there.linearisation
     keep = _excited(problem, free, projected(problem, lin)[0])
     cost = np.sum(settled.residual[problem.fitted] ** 2)
@@ -123,12 +122,17 @@ def fit(
 
 
 def _differences_there(
-    problem: Problem, theta, start, free, relative: np.ndarray, lin: Linearisation
+    problem: Problem, theta, start, free, relative: np.ndarray, lin, settled: Linearisation
 ) -> Differences:
-    """Return the differences where a fit has come to: those that led there if they are smooth."""
+    """Return the differences at settled initial states, with steps as before if they were smooth.
+
+    Of that `lin` tells, the linearisation where Gauss-Newton steps ended.
+    """
     if any(is_erratic(column) for column in projected(problem, lin)[0].T):
-        return clear_differences(problem, theta, start, free, lin.start)
-    return Differences(relative, np.ones(len(free), bool), lin)
+        return clear_differences(problem, theta, start, free, settled.start)
+    steps = difference_steps(problem, theta, free, relative)
+    there = linearise(problem, theta, start, free, steps, settled.start, settled.residual)
+    return Differences(relative, np.ones(len(free), bool), there)
 
 
 def _settle_all(problem: Problem, theta, start, lin: Linearisation):

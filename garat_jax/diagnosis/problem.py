@@ -162,7 +162,13 @@ class Linearisation(NamedTuple):
 
 
 def linearise(
-    problem: Problem, theta, start, columns, steps, sensitivity: np.ndarray | None = None
+    problem: Problem,
+    theta,
+    start,
+    columns,
+    steps,
+    sensitivity: np.ndarray | None = None,
+    residual: np.ndarray | None = None,
 ) -> Linearisation:
     """Simulate the point and one perturbation a column and a component of the initial state.
 
@@ -174,20 +180,23 @@ def linearise(
         steps: Their perturbations.
         sensitivity: Derivatives by the initial states from nearby, [S, N, nq + nv]; they are most
             of the simulations and change little.
+        residual: At the point itself, if that is known, [S, N].
     """
     unit = problem.segments.start_unit
     num_start = len(unit) if sensitivity is None else 0
-    thetas = np.tile(theta, (1 + len(columns) + num_start, *np.ones(np.ndim(theta), int)))
+    first = 1 if residual is None else 0
+    thetas = np.tile(theta, (first + len(columns) + num_start, *np.ones(np.ndim(theta), int)))
     for i, (j, step) in enumerate(zip(columns, steps, strict=True)):
-        thetas[1 + i, ..., j] += step
+        thetas[first + i, ..., j] += step
     starts = np.tile(start, (len(thetas), 1, 1))
     for i in range(num_start):
-        starts[1 + len(columns) + i, :, i] += START_STEP * unit[i]
+        starts[first + len(columns) + i, :, i] += START_STEP * unit[i]
     residuals = problem.whiten(problem.simulator.predict(thetas, starts, problem.segments))
-    changes = np.moveaxis(residuals[1:] - residuals[0], 0, -1)
+    here = residuals[0] if residual is None else residual
+    changes = np.moveaxis(residuals[first:] - here, 0, -1)
     parameters = changes[..., : len(columns)] / np.asarray(steps, float)
     by_start = changes[..., len(columns) :] / START_STEP if sensitivity is None else sensitivity
-    return Linearisation(residuals[0], parameters, by_start)
+    return Linearisation(here, parameters, by_start)
 
 
 class StartSpace:

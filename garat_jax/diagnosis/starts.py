@@ -182,7 +182,8 @@ def settle_starts(problem: Problem, theta, start, lin: Linearisation, iterations
         again = open_still & (is_stale | better) & (fall < KEPT_PROMISE * promised)
         if np.any(again):
             own = theta[again] if np.ndim(theta) > 1 else theta
-            fresh = linearise(problem.take(again), own, start[again], (), ())
+            some = problem.take(again)
+            fresh = linearise(some, own, start[again], (), (), residual=lin.residual[again])
             lin.start[again] = fresh.start
         is_stale = np.where(again, False, is_stale | better)
     return start, lin
