@@ -98,6 +98,8 @@ def fit(
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
     """
     theta, free = np.array(theta, float), tuple(free)
+    if not free:
+        return settle(problem, theta, start)
     there = clear_differences(problem, theta, start, free, sensitivity)
     is_stale, descents = sensitivity is not None, 0
     while True:

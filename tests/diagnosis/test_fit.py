@@ -120,6 +120,14 @@ def test_settled_initial_states_leave_only_noise():
     assert np.sqrt(np.mean(settled.residual**2)) == pytest.approx(1.0, abs=0.25)
 
 
+def test_a_fit_of_no_parameters_settles_the_initial_states():
+    problem = make_problem([record(UNIFORM)], candidates())
+    start = problem.segments.start + 0.05
+    settled = settle(problem, problem.simulator.base, start)
+    found = fit(problem, settled.theta, start, (), sensitivity=settled.sensitivity)
+    np.testing.assert_array_equal(found.residual, settled.residual)
+
+
 def test_initial_states_are_projected_out():
     rng = np.random.default_rng(0)
     sensitivity = rng.normal(size=(3, 20, 2))
