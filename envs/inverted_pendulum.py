@@ -48,4 +48,5 @@ class InvertedPendulum(Task):
 
     def terminated(self, after: PhysicsState) -> jax.Array:
         """Say whether the pole has fallen; a state that is not finite has."""
-        return ~(jnp.abs(after.qpos[1]) <= FALLEN)
+        finite = jnp.isfinite(after.qpos).all() & jnp.isfinite(after.qvel).all()
+        return ~(finite & (jnp.abs(after.qpos[1]) <= FALLEN))

@@ -55,7 +55,8 @@ def test_the_page_on_your_own_robot_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "own_robot", types.ModuleType("own_robot"))  # for dataclasses
     for snippet in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(snippet, names)
-    assert names["config"].pair.task.mjcf.is_file()
+    source, target = names["config"].pair.worlds()
+    assert source.env.obs_size == target.env.obs_size == names["obs"].shape[1]
     assert names["obs"].shape == (8, 4)
     assert np.isfinite(names["metrics"]["value_loss"])
     assert "(8, 4)" in capsys.readouterr().out

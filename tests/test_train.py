@@ -1,5 +1,7 @@
 """The host loop with tiny learners: resume, stop on NaN, stop when solved, compiler options."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,9 @@ from rich.console import Console
 from garat_jax import checkpoint, compiler_options, train
 from garat_jax.agents import ppo
 from garat_jax.dynamics import Override
+from garat_jax.effects import Backlash
 from garat_jax.env import make_world
+from garat_jax.envs.half_cheetah import HalfCheetah
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.errors import DivergedError
 from garat_jax.runs import RunDirectory
@@ -174,9 +178,13 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", pytest.param("mjx", marks
 
 
 def pendulums(engine: str, gear: float):
-    """Return a step and a start of PPO on pendulums whose motor is so strong, and their params."""
+    """Return `learners` on pendulums whose motor is so strong."""
     strong = Override("actuator", "slide", "gear", gear)
-    world = make_world(InvertedPendulum(), (strong,), engine=engine)
+    return learners(make_world(InvertedPendulum(), (strong,), engine=engine))
+
+
+def learners(world):
+    """Return a step and a start of PPO in a world, and its params."""
     agent = ppo.make(world.env, ppo.PPOConfig(num_envs=4, num_steps=8, hidden=(8,)))
     keys = jax.vmap(jax.random.key)(jnp.asarray(SEEDS))
     start = jax.vmap(lambda key: agent.init(key, world.params))(keys)
@@ -199,6 +207,15 @@ def test_a_world_that_fails_once_ends_its_episode_and_training_goes_on(
         capsys.readouterr().err.split()
     )
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((state.env.obs, state.policy)))
+
+
+def test_episodes_that_begin_with_a_motor_apart_from_its_joint_are_no_failure(tmp_path):
+    task = dataclasses.replace(HalfCheetah(), episode_length=4)  # a batch ends with a reset
+    world = make_world(task, effects=(Backlash("joint/back_hip", gap=0.01),), engine="mujoco")
+    step, start, params = learners(world)
+    run = directory(tmp_path / "run")
+    Trainer(run, SEEDS).train("play", step, start, params, 2)
+    assert [line["faulty_share"] for line in run.metrics()] == [[0.0, 0.0]] * 2
 
 
 @ENGINES

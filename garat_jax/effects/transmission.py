@@ -28,6 +28,8 @@ CONTACT = 0.5
 """Impulse per speed of contact in a substep, relative to the reduced inertia."""
 SPRING_SHARE = 0.25
 """Part of the contact's impulse per speed that is its spring's; the rest is damping."""
+NOWHERE = 1e9
+"""Joint angle [rad] before the first substep: one that no joint has."""
 IMPLICIT = (
     int(mujoco.mjtIntegrator.mjINT_IMPLICIT),
     int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
@@ -123,7 +125,7 @@ class Transmission(Effect, abc.ABC):
         """Return a motor at rest relative to its joint."""
         del host
         nothing = jnp.zeros(())
-        return Motor(nothing, nothing, nothing, nothing, jnp.full((), jnp.inf))
+        return Motor(nothing, nothing, nothing, nothing, jnp.full((), NOWHERE))
 
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Take the motor's inertia, and its servo's implicit damping, off the joint."""

@@ -79,6 +79,17 @@ def test_a_step_is_gymnasiums(engine, tolerance, make):
         np.testing.assert_array_equal(reward * ~terminated, expected_reward)
 
 
+def test_a_state_that_is_not_finite_ends_the_episode():
+    world = make_world(InvertedPendulum(), engine="mujoco")
+    physics = world.env.reset(world.params, jax.random.key(0)).physics
+    assert not InvertedPendulum().terminated(physics)
+    for field in ("qpos", "qvel"):
+        for number in (0, 1):
+            for bad in (np.nan, np.inf):
+                lost = getattr(physics, field).at[number].set(bad)
+                assert InvertedPendulum().terminated(physics._replace(**{field: lost}))
+
+
 def test_action_bounds_time_step_and_time_limit_are_gymnasiums():
     world = make_world(InvertedPendulum(), engine="mujoco")
     reference = PendulumV4()
