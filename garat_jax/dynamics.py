@@ -221,14 +221,13 @@ def hold(
 ) -> PhysicsState:
     """Do a `step` in which the mechanism stays where it is, with the velocity that it has.
 
-    Commands that are late get under way, actuators are activated and sensors note.
+    Commands that are late get under way, gears bend, actuators are activated and sensors note.
     """
+    still = state._replace(qvel=jnp.zeros_like(state.qvel))  # so that gears do not lose it
+    *_, memory = _commands(dynamics, view(dynamics), still, state.memory, ctrl, num_substeps)
+    held = state._replace(memory=memory)
     if dynamics.host.model.na:
-        moved = move(dynamics, state, ctrl, num_substeps)
-        held = moved._replace(time=state.time, qpos=state.qpos, qvel=state.qvel)
-    else:
-        *_, memory = _commands(dynamics, view(dynamics), state, state.memory, ctrl, num_substeps)
-        held = state._replace(memory=memory)
+        held = held._replace(act=move(dynamics, state, ctrl, num_substeps).act)
     return note(dynamics, held, num_substeps * dynamics.timestep)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from garat_jax import dynamics
-from garat_jax.effects import ActuatorDelay
+from garat_jax.effects import ActuatorDelay, JointFlexibility
 from tests.models import MUSCLE, PENDULUM, spec
 
 
@@ -39,3 +39,20 @@ def test_while_a_mechanism_is_held_its_muscles_are_activated():
     held = dynamics.hold(world, start, jnp.ones(world.host.model.nu), 10)
     np.testing.assert_array_equal(held.qpos, start.qpos)
     assert np.all(held.act > 0.1)
+    for before, after in ((start.time, held.time), (start.qvel, held.qvel)):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_while_a_mechanism_is_held_its_gears_bend_however_fast_it_goes():
+    geared = PENDULUM.replace('damping="0.01"', 'armature="0.01"')
+    bent = compiled(geared, JointFlexibility("joint/hinge", stiffness=20.0, damping=0.5))
+
+    def wound(speed: float):
+        state = dynamics.initial_state(bent, jnp.asarray([0.4]), jnp.asarray([speed]))
+        return dynamics.hold(bent, state, jnp.asarray([2.0]), 200).memory[0]
+
+    motors = [wound(speed) for speed in (0.0, 1e-4, 1.0)]
+    for motor in motors:  # the torque of 2 N m, and nothing goes on
+        np.testing.assert_allclose(motor.deflection, 2.0 / 20.0, rtol=0.05)
+        np.testing.assert_allclose(motor.slip, motors[0].slip, atol=1e-9)
+
