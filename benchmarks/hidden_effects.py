@@ -88,12 +88,13 @@ def say(row: dict[str, Any]) -> None:
               f"true {e['true']:.4g}", flush=True)  # fmt: skip
 
 
-def read_rows(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the rows of an earlier run that need not be made again, by case."""
+def read_rows(path: Path, commit: str | None) -> dict[str, dict[str, Any]]:
+    """Return the rows of an interrupted run of the same commit, by case."""
     if not path.exists():
         return {}
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    return {row["case"]: row for row in rows if row["status"] == "done"}
+    same = [row for row in rows if row["status"] == "done" and row["commit"] == commit]
+    return {row["case"]: row for row in same}
 
 
 def recorded_rows(seed: int) -> dict[str, dict[str, Any]]:
@@ -106,7 +107,10 @@ def recorded_rows(seed: int) -> dict[str, dict[str, Any]]:
 
 
 def _keep_to_own_cores(numbers, jobs: int) -> None:
-    """Keep a job to its share of the cores: threads of two jobs that take turns wait for long."""
+    """Keep a job to its share of the cores: threads of two jobs that take turns wait for long.
+
+    BLAS has made its threads by now, on all cores: `run` sees to it that they are as few.
+    """
     if hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, cores[numbers.get() % len(cores) :: jobs])
@@ -117,13 +121,15 @@ def run(
     robots: Sequence[str],
     jobs: int,
     path: Path,
-    earlier: dict[str, dict[str, Any]],
+    recorded: dict[str, dict[str, Any]],
 ) -> list[dict[str, Any]]:
     """Run all cases that have no earlier row, append them to a file, and return all rows."""
     commit = (git_state() or {}).get("commit")
+    earlier = recorded | read_rows(path, commit)
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = [earlier[case.name] for case in cases if case.name in earlier]
     todo = [case for case in cases if case.name not in earlier]
+    os.environ["OPENBLAS_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // jobs))
     context = multiprocessing.get_context("spawn")
     numbers = context.SimpleQueue()
     for number in range(jobs):
@@ -191,7 +197,7 @@ def main() -> None:
     earlier = recorded_rows(arguments.seed) if arguments.extend else {}
     if beyond := earlier.keys() - {case.name for case in cases}:
         parser.error(f"--extend would drop {len(beyond)} recorded sets; give a larger --sample")
-    rows = run(cases, arguments.robots, arguments.jobs, path, earlier | read_rows(path))
+    rows = run(cases, arguments.robots, arguments.jobs, path, earlier)
     lines = report(rows)
     picked = arguments.only or arguments.robots != list(ROBOTS)
     if not picked and not any(row["status"] == score.NOT_YET for row in rows):

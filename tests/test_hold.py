@@ -55,4 +55,3 @@ def test_while_a_mechanism_is_held_its_gears_bend_however_fast_it_goes():
     for motor in motors:  # the torque of 2 N m, and nothing goes on
         np.testing.assert_allclose(motor.deflection, 2.0 / 20.0, rtol=0.05)
         np.testing.assert_allclose(motor.slip, motors[0].slip, atol=1e-9)
-

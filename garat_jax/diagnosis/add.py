@@ -9,7 +9,6 @@ import numpy as np
 from garat_jax.diagnosis.diagnose import thin
 from garat_jax.diagnosis.fit import count_timestep, fit
 from garat_jax.diagnosis.horizon import choose_horizon
-from garat_jax.diagnosis.localise import missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
@@ -118,7 +117,7 @@ def size(
         segments,
         np.ones(len(segments.start), bool),
         grid.interval * grid.per_sample,
-        suggest((effect,), missing_torque(host, recordings)),
+        suggest((effect,), host, recordings),
     )
     metric = make_metric(dataclasses.replace(problem, fitted=~problem.fitted))
     before = settle(problem, simulator.base, segments.start)
@@ -149,13 +148,13 @@ def _best_fit(problem: Problem, before: Fit, effect: Effect, given, free) -> Fit
     """Fit from every size at which the effect should be tried; return the best."""
     simulator = problem.simulator
     fits = []
-    starts = type(effect).starts(simulator.host, effect.target)
-    for suggestion in problem.suggested.values():
-        starts += suggestion.starts
-    for sizes in starts:
+    begun = []
+    for sizes in problem.starts(0):
         theta = before.theta.copy()
         for j, slot in enumerate(simulator.slots):
             if slot.parameter.name in sizes and slot.parameter.name not in given:
                 theta[j] = sizes[slot.parameter.name]
+        begun.append(theta)
+    for theta in np.unique(begun, axis=0):  # those that differ in given parameters only are one
         fits.append(fit(problem, theta, before.start, free))
     return count_timestep(problem, min(fits, key=lambda fitted: float(fitted.cost.sum())))

@@ -107,8 +107,10 @@ class Comparison:
     def __str__(self) -> str:
         lines = [self.sentence, f"  residuals: {self.residuals.sentence(self.near_noise)}"]
         for name, row in self.error.per_signal.items():
+            moves = np.isfinite(row["fit_percent"])
+            fit = f"fit {row['fit_percent']:.1f} %" if moves else "hardly moves"
             lines.append(
-                f"  {name}: {row['before']:.4g} {row['unit']} (fit {row['fit_percent']:.1f} %, "
+                f"  {name}: {row['before']:.4g} {row['unit']} ({fit}, "
                 f"noise {row['noise_floor']:.2g} {row['unit']})"
             )
         lines += [f"  torque at {torque.sentence}" for torque in self.torques]

@@ -230,11 +230,13 @@ def with_evidence(
 ) -> list[Contender]:
     """Give contenders the p-values of what their fits change, with Bonferroni's correction.
 
+    A candidate of which many sizes were tried pays for them alone (weighted, Holm 1979).
+
     Args:
         problem: The recordings and the model with every candidate.
         current: The fit of the effects selected so far.
         contenders: The candidates that were fitted.
-        num_tests: How many candidates there were, each counted as often as a size of it was tried.
+        num_tests: How many candidates there were.
     """
     if not contenders:
         return []
@@ -250,7 +252,8 @@ def with_evidence(
         if np.linalg.norm(change) > VISIBLE:
             num_fitted = len({*score.columns} - {*contender.fit.frozen})
             p_value = evidence.p_value(score.effect, change[:, None], max(num_fitted, 1))
-        score = dataclasses.replace(score, p_value=min(1.0, num_tests * p_value))
+        p_value *= num_tests * problem.num_tried(score.effect)
+        score = dataclasses.replace(score, p_value=min(1.0, p_value))
         tested.append(dataclasses.replace(contender, score=score))
     return tested
 

@@ -65,7 +65,7 @@ def diagnose(
         for refine in (1, 2)
     )
     sample = grid.interval * grid.per_sample
-    suggested = suggest(simulator.effects, missing_torque(host, fitted))
+    suggested = suggest(simulator.effects, host, fitted)
     seen = segments.recording < len(fitted)
     problem = Problem(simulator, finer, segments, seen, sample, suggested)
     say("the model as it is")

@@ -106,7 +106,7 @@ def fit(
         near, descents = there, descents + 1
         theta, start, lin = _descend(problem, free, iterations, rival, theta, start, near, is_stale)
         start, settled, is_better = _settle_all(problem, theta, start, lin)
-        there = _differences_there(problem, theta, start, free, near.relative, lin, settled)
+        there = _differences_there(problem, theta, start, free, near.relative, settled)
         is_wider = np.any(there.is_clear & (there.relative > near.relative))
         if descents == DESCENTS or not (is_better or is_wider):
             break
@@ -124,16 +124,13 @@ def fit(
 
 
 def _differences_there(
-    problem: Problem, theta, start, free, relative: np.ndarray, lin, settled: Linearisation
+    problem: Problem, theta, start, free, relative: np.ndarray, settled: Linearisation
 ) -> Differences:
-    """Return the differences at settled initial states, with steps as before if they were smooth.
-
-    Of that `lin` tells, the linearisation where Gauss-Newton steps ended.
-    """
-    if any(is_erratic(column) for column in projected(problem, lin)[0].T):
-        return clear_differences(problem, theta, start, free, settled.start)
+    """Return the differences at settled initial states, with steps as before where those do."""
     steps = difference_steps(problem, theta, free, relative)
     there = linearise(problem, theta, start, free, steps, settled.start, settled.residual)
+    if any(is_erratic(column) for column in projected(problem, there)[0].T):
+        return clear_differences(problem, theta, start, free, settled.start)
     return Differences(relative, np.ones(len(free), bool), there)
 
 

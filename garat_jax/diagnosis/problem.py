@@ -86,6 +86,18 @@ class Problem(Generic[AnySimulator]):
         """Seconds of a segment."""
         return self.segments.measured.shape[1] * self.interval
 
+    def starts(self, effect: int) -> tuple[Mapping[str, float], ...]:
+        """Return the sizes at which to try an effect, by parameter: listed ones and suggested."""
+        law = self.simulator.effects[effect]
+        listed, suggestion = law.starts(self.simulator.host, law.target), self.suggested.get(effect)
+        return listed if suggestion is None else (*listed, *suggestion.starts)
+
+    def num_tried(self, effect: int) -> int:
+        """Return how many sizes of an effect were looked at, for the correction of its p-value."""
+        law, suggestion = self.simulator.effects[effect], self.suggested.get(effect)
+        listed = len(law.starts(self.simulator.host, law.target))
+        return listed + (suggestion.num_tried if suggestion is not None else 0)
+
     def take(self, chosen: np.ndarray) -> "Problem[AnySimulator]":
         """Return the problem of some of the segments."""
         segments = self.segments.take(chosen)

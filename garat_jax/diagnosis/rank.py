@@ -32,7 +32,7 @@ from garat_jax.diagnosis.judge import (
 from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor, trusted
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Candidate, Named
-from garat_jax.diagnosis.screen import Score, screen
+from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.steps import Step, prune, refitted, swap
 
@@ -223,7 +223,8 @@ def _round(problem: Problem, metric: Metric, current: Fit, held, floor: Floor, s
     contenders = fit_contenders(problem, current, scores, say) if gap else []
     contenders = _refine(problem, metric, current, scores, contenders, floor, say)
     contenders = with_twins(problem, current, scores, contenders, say)
-    contenders = with_evidence(problem, current, contenders, _num_tried(problem, scores))
+    num_tests = len([score for score in scores if not score.excluded])
+    contenders = with_evidence(problem, current, contenders, num_tests)
     return judge(problem, metric, current, scores, contenders, gap)
 
 
@@ -276,14 +277,6 @@ def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:
     for contender in added:
         last = complete(problem, dataclasses.replace(last, score=contender.score), say)
     return last
-
-
-def _num_tried(problem: Problem, scores: Sequence[Score]) -> int:
-    """Return how many sizes of candidates were tried."""
-    tried = [score.effect for score in scores if not score.excluded]
-    effects = (problem.simulator.effects[index] for index in tried)
-    listed = sum(len(effect.starts(problem.simulator.host, effect.target)) for effect in effects)
-    return listed + sum(problem.suggested[i].num_tried for i in tried if i in problem.suggested)
 
 
 def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):

@@ -10,7 +10,7 @@ import numpy as np
 from garat_jax.diagnosis.measurements import Recording, estimate_velocity, signals
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.segments import Grid, Segments, choose_grid, cut, metric_spread
+from garat_jax.diagnosis.segments import QUIET, Grid, Segments, choose_grid, cut, metric_spread
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 
@@ -20,8 +20,10 @@ class Size(NamedTuple):
 
     Attributes:
         rmse: Root mean square error, in the signal's unit.
-        relative: The same by the signal's standard deviation.
-        fit_percent: 100 (1 - |y - ŷ| / |y - mean y|), as in system identification.
+        relative: The same by what the signal's error is held against; see
+            `segments.metric_spread`.
+        fit_percent: 100 (1 - |y - ŷ| / |y - mean y|), as in system identification; not a number
+            where the signal moves no more than `segments.QUIET` times its noise.
         noise: Standard deviation of the signal's noise.
         unit: The signal's unit.
     """
@@ -57,23 +59,29 @@ class Replay:
         return (self.predicted - self.segments.measured) * self.segments.weight[..., None]
 
     def only(self, recordings: Sequence[int]) -> "Replay":
-        """Return the part of some recordings, by number; spreads are those within them."""
+        """Return the part of some recordings, by number."""
         kept = np.isin(self.segments.recording, list(recordings))
-        segments = self.segments.take(kept)
-        spread = metric_spread(segments.measured[segments.weight > 0], segments.noise)
-        segments = dataclasses.replace(segments, spread=spread)
-        return dataclasses.replace(self, segments=segments, predicted=self.predicted[kept])
+        segments, predicted = self.segments.take(kept), self.predicted[kept]
+        return dataclasses.replace(self, segments=segments, predicted=predicted)
+
+    @property
+    def spread(self) -> np.ndarray:
+        """What the error of each signal is held against, [num_signals]; see `metric_spread`."""
+        return metric_spread(self.segments.measured[self.segments.weight > 0], self.segments.noise)
 
     def sizes(self) -> dict[str, Size]:
         """Return how far the predictions of each signal are off."""
         found = {}
         sampled = self.segments.weight > 0
         deviation = self.deviation[sampled]
+        deviations, spread = self.segments.measured[sampled].std(axis=0), self.spread
         for i, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
             rmse = float(np.sqrt(np.mean(deviation[:, i] ** 2)))
-            relative = rmse / float(self.segments.spread[i])
+            relative = rmse / float(spread[i])
             noise = float(self.segments.noise[i])
-            found[name] = Size(rmse, relative, 100 * (1 - relative), noise, unit)
+            moves = deviations[i] > QUIET * noise
+            fit = 100 * (1 - rmse / float(deviations[i])) if moves else np.nan
+            found[name] = Size(rmse, relative, fit, noise, unit)
         return found
 
     def error(self) -> float:
@@ -82,7 +90,7 @@ class Replay:
 
     def worst(self, count: int) -> list[int]:
         """Return the segments with the largest relative error, largest first."""
-        relative = self.deviation / self.segments.spread
+        relative = self.deviation / self.spread
         samples = self.segments.weight.sum(axis=1)
         return list(np.argsort(-(relative**2).sum(axis=(1, 2)) / samples)[:count])
 
@@ -113,10 +121,7 @@ def replay_with(
     horizon: float,
     chosen: Sequence[int] | None = None,
 ) -> Replay:
-    """Predict all recordings, or chosen ones, with a simulator that is compiled; see `replay`.
-
-    Spreads, by which errors are told, are those within the recordings predicted.
-    """
+    """Predict all recordings, or chosen ones, with a simulator that is compiled; see `replay`."""
     shown = range(len(recordings)) if chosen is None else list(chosen)
     segments = cut(recordings, grid, horizon)
     segments = segments.take(np.isin(segments.recording, shown))
@@ -126,14 +131,13 @@ def replay_with(
     settled = settle(problem, simulator.base, segments.start)
     residual = settled.residual.reshape(segments.measured.shape)
     of_state = signals(simulator.host)[: segments.measured.shape[2]]
-    played = Replay(
+    return Replay(
         horizon=horizon,
         names=tuple(s.name for s in of_state),
         units=tuple(s.unit for s in of_state),
         segments=segments,
         predicted=segments.measured + residual * segments.noise,
     )
-    return played.only(shown)
 
 
 def as_recordings(

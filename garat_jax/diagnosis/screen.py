@@ -3,7 +3,8 @@
 A candidate's sensitivity is the change of the predictions at a realistic size of its parameters; a
 law with a threshold, which does nothing below it, is tried at several (`Effect.starts`; see
 `trials`). What initial states and parameters already free can explain is projected out. P-values
-(`evidence`) have Holm's correction (1979); those of the candidates that are fitted are replaced.
+(`evidence`) pay for every size that was tried and have Holm's correction (1979); those of the
+candidates that are fitted are replaced.
 """
 
 import dataclasses
@@ -166,7 +167,7 @@ def _score(
     total = float(residual @ residual)
     share = 1.0 - float(np.sum((residual + contribution) ** 2)) / total if total > 0 else 0.0
     size, start, possible = _size(problem.simulator, rows, trial, chosen, factor)
-    p_value = evidence.p_value(trial.effect, matrix)
+    p_value = min(1.0, problem.num_tried(trial.effect) * evidence.p_value(trial.effect, matrix))
     columns = tuple(rows[i].column for i in chosen)
     return Score(trial.effect, columns, size, start, share, p_value, possible, contribution)
 

@@ -70,14 +70,11 @@ def _sizes(problem: Problem[Simulator], theta: np.ndarray, index: int, columns: 
     """Return the sizes at which to try an effect; half and twice its size where it acts already."""
     simulator = problem.simulator
     effect = simulator.effects[index]
-    starts = effect.starts(simulator.host, effect.target)
     none = effect.at(simulator.host, effect.target)
     slots = [simulator.slots[j].parameter for j in columns]
     acts = any(theta[j] != none[p.name] for j, p in zip(columns, slots, strict=True))
-    if not acts:
-        suggestion = problem.suggested.get(index)
-        return starts if suggestion is None else (*starts, *suggestion.starts)
-    if len(starts) == 1:
+    starts = problem.starts(index)
+    if not acts or len(starts) == 1:
         return starts
     first, size = slots[0], float(theta[columns[0]])
     return tuple({first.name: min(factor * size, first.high)} for factor in (0.5, 2.0))

@@ -9,19 +9,21 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from scipy import signal
+from scipy import optimize, signal
 
 from garat_jax.effects.actuator import can_bias, make_affine
 from garat_jax.effects.at_joint import at_dof
 from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
 
-BINS_PER_PERIOD = 2
-"""Bins of the angle in half of the shortest period of a ripple."""
+BINS_PER_PERIOD = 4
+"""Bins of the angle in the shortest period of a ripple."""
 MOST_BINS = 2**20
 """Bins of the angle at most; a joint that turns for long shows no shorter periods than these do."""
 FINER = 4
 """Points of the spectrum for each that the range of the angle resolves."""
-PEAKS = 4
+SMOOTH = 3
+"""Degree of the polynomial of the angle that stands for other laws beside a ripple."""
+PEAKS = 2
 """Ripples that are suggested: noise of fast motion may stand out more than a small one."""
 
 
@@ -217,21 +219,26 @@ class CoggingTorque(Effect):
 
     @classmethod
     def suggested(cls, position: np.ndarray, torque: np.ndarray) -> Suggestion | None:
-        """Return the ripples that stand out of the missing torque's spectrum over the angle."""
+        """Return the ripples that stand out of the missing torque's spectrum over the angle.
+
+        Each is taken away before the next is looked for, or that were its sidelobe (Högbom 1974).
+        Slower ripples than two periods in the range of the angle are hard to tell from other laws.
+        """
         span = float(np.ptp(position))
-        periods = next(p for p in cls.parameters() if p.name == "periods")
-        low, high = max(periods.low, 2 * np.pi / max(span, 1e-9)), periods.high
+        amplitude, periods, _ = cls.parameters()
+        low, high = max(periods.low, 4 * np.pi / max(span, 1e-9)), periods.high
         if low >= high:
             return None
-        width = max(np.pi / (BINS_PER_PERIOD * high), span / MOST_BINS)
-        sums = np.bincount(((position - position.min()) / width).astype(int), torque)
-        size = FINER * len(sums)
-        spectrum = np.abs(np.fft.rfft(sums, size))
-        at = 2 * np.pi * np.arange(len(spectrum)) / (size * width)
-        peaks = signal.find_peaks(spectrum * ((at >= low) & (at <= high)))[0]
-        peaks = peaks[np.argsort(-spectrum[peaks])][:PEAKS]
-        starts = tuple(_wave(float(at[peak]), position, torque) for peak in peaks)
-        return Suggestion(starts, math.ceil((high - low) * span / (2 * np.pi)))
+        starts, rest = [], torque
+        for _ in range(PEAKS):
+            peak = _highest_peak(position, rest, low, high)
+            if peak is None:
+                break
+            size, phase, _ = _wave(peak, position, rest)
+            rest = rest - size * np.sin(peak * position + phase)
+            size = min(size, amplitude.high)
+            starts.append({"amplitude": size, "periods": peak, "phase": phase})
+        return Suggestion(tuple(starts), math.ceil((high - low) * span / (2 * np.pi)))
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
         """Add the torque at the present angle."""
@@ -241,9 +248,37 @@ class CoggingTorque(Effect):
         return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
 
 
-def _wave(periods: float, position: np.ndarray, torque: np.ndarray) -> dict[str, float]:
-    """Return the ripple with some periods that is most like a torque."""
+def _highest_peak(position: np.ndarray, torque: np.ndarray, low: float, high: float):
+    """Return which ripple in a band, in periods a turn, a torque has most of; None if none."""
+    span = float(np.ptp(position))
+    rest = torque - np.polynomial.Polynomial.fit(position, torque, SMOOTH)(position)
+    width = max(2 * np.pi / (BINS_PER_PERIOD * high), span / MOST_BINS)
+    sums = np.bincount(((position - position.min()) / width).astype(int), rest)
+    size = FINER * len(sums)
+    spectrum = np.abs(np.fft.rfft(sums, size))
+    step = 2 * np.pi / (size * width)
+    peaks = signal.find_peaks(spectrum)[0]
+    peaks = peaks[(peaks * step >= low) & (peaks * step <= high)]
+    if not len(peaks):
+        return None
+    highest = step * peaks[np.argmax(spectrum[peaks])]
+    bounds = max(low, highest - step), min(high, highest + step)
+    best = optimize.minimize_scalar(
+        lambda periods: _wave(periods, position, torque)[2], bounds=bounds, method="bounded"
+    )
+    return float(best.x)
+
+
+def _wave(periods: float, position: np.ndarray, torque: np.ndarray) -> tuple[float, float, float]:
+    """Fit a ripple with some periods beside a smooth law of the position.
+
+    Returns:
+        Its amplitude, its phase and the sum of squares that both leave.
+    """
+    centred = 2.0 * (position - position.min()) / np.ptp(position) - 1.0
+    smooth = np.polynomial.polynomial.polyvander(centred, SMOOTH)
     waves = np.stack([np.sin(periods * position), np.cos(periods * position)], axis=1)
-    sine, cosine = np.linalg.lstsq(waves, torque, rcond=None)[0]
-    phase = float(np.arctan2(cosine, sine))
-    return {"amplitude": float(np.hypot(sine, cosine)), "periods": periods, "phase": phase}
+    columns = np.concatenate([waves, smooth], axis=1)
+    factor = np.linalg.lstsq(columns, torque, rcond=None)[0]
+    size, phase = np.hypot(factor[0], factor[1]), np.arctan2(factor[1], factor[0])
+    return float(size), float(phase), float(np.sum((torque - columns @ factor) ** 2))

@@ -19,6 +19,7 @@ def record(
     pull: float = 0.0,
     torque: Callable[[float], float] = lambda speed: 0.0,
     ripple: Callable[[float], float] = lambda angle: 0.0,
+    control: Callable[[float, float, float], float] | None = None,
 ) -> Recording:
     """Record a pendulum that differs from the model, and at which a cable pulls [N m].
 
@@ -28,6 +29,7 @@ def record(
         pull: A constant torque.
         torque: One more torque [N m] by the speed [rad/s].
         ripple: And one by the angle [rad].
+        control: Gives the command by time, angle and speed, instead of random steps and a sine.
     """
     rng = np.random.default_rng(seed)
     spec = models.spec(models.PENDULUM)
@@ -38,9 +40,11 @@ def record(
     data.qpos[0] = 0.8
     ctrl = rng.uniform(-1, 1, 8)[(TIME / 0.4).astype(int)] + 0.5 * np.sin(9 * TIME)
     states = []
-    for command in ctrl:
+    for k, time in enumerate(TIME):
         states.append([data.qpos[0], data.qvel[0]])
-        data.ctrl[0] = command
+        if control is not None:
+            ctrl[k] = control(time, *states[-1])
+        data.ctrl[0] = ctrl[k]
         for _ in range(round(0.004 / model.opt.timestep)):
             data.qfrc_applied[0] = pull + torque(data.qvel[0]) + ripple(data.qpos[0])
             mujoco.mj_step(model, data)

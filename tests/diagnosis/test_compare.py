@@ -11,7 +11,7 @@ from garat_jax.diagnosis import compare, load_model
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
-from garat_jax.diagnosis.segments import Segments
+from garat_jax.diagnosis.segments import QUIET, Segments
 from garat_jax.runs import RunDirectory
 from tests import models
 
@@ -130,10 +130,18 @@ def test_sizes_by_hand():
     played = handmade(predicted, measured, np.asarray([[1.0, 1.0], [1.0, 0.0]]))
     size = played.sizes()["qpos.hinge"]
     assert size.rmse == pytest.approx(np.sqrt((9 + 16 + 0) / 3))
-    assert size.relative == pytest.approx(size.rmse / 2)
-    assert size.fit_percent == pytest.approx(100 * (1 - size.rmse / 2))
+    assert size.relative == pytest.approx(size.rmse / (QUIET * 0.1))
+    assert np.isnan(size.fit_percent)  # nothing moves
     assert played.error() == pytest.approx(size.relative)
     assert played.worst(1) == [0]
+
+
+def test_the_fit_of_a_signal_is_relative_to_its_standard_deviation():
+    measured = np.asarray([[[1.0], [5.0]], [[-3.0], [1.0]]])
+    off = np.asarray([[[1.0], [-1.0]]])
+    played = handmade(measured + off, measured, np.ones((2, 2)))
+    size = played.sizes()["qpos.hinge"]
+    assert size.fit_percent == pytest.approx(100 * (1 - 1.0 / np.sqrt(8.0)))
 
 
 def test_predictions_take_the_place_of_measurements(recorded):

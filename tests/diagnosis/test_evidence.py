@@ -12,7 +12,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.robust import wald_test
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
-from garat_jax.effects import ActuatorDelay, ViscousDamping
+from garat_jax.effects import ActuatorDelay, Suggestion, ViscousDamping
 from tests.diagnosis.test_fit import make_problem, record
 
 TIME = np.arange(500) * 0.004
@@ -46,6 +46,15 @@ def test_every_candidate_that_was_tried_makes_a_p_value_larger():
     problem = make_problem([record(TIME, seed=3)], (ViscousDamping("joint/hinge"),))
     one = evidence_for_damping(problem)
     assert evidence_for_damping(problem, num_tests=3) == pytest.approx(min(1.0, 3 * one))
+
+
+def test_every_size_that_was_looked_at_makes_its_own_p_value_larger():
+    problem = make_problem([record(TIME, damping=0.002)], (ViscousDamping("joint/hinge"),))
+    searched = dataclasses.replace(problem, suggested={0: Suggestion((), 2)})
+    one = evidence_for_damping(problem)
+    assert 0 < one < 0.2
+    assert evidence_for_damping(searched) == pytest.approx(3 * one)
+    assert searched.starts(0) == problem.starts(0)
 
 
 def test_damping_is_not_significant_where_it_is_not_there():
