@@ -45,6 +45,7 @@ class MissingTorque(NamedTuple):
 
     Attributes:
         dofs: Name of each dof's joint.
+        actuators: Name of each actuator.
         time: Seconds, [M].
         position: [M, nv]; zero for dofs of ball and free joints.
         velocity: [M, nv].
@@ -52,9 +53,12 @@ class MissingTorque(NamedTuple):
         command: Torque of the model's actuators, [M, nv].
         load: Gravity and Coriolis torque, [M, nv].
         torque: What is missing, [M, nv].
+        ctrl: The actuators' commands, [M, nu].
+        drive: Torque of each of the model's actuators at its joint, [M, nu].
     """
 
     dofs: tuple[str, ...]
+    actuators: tuple[str, ...]
     time: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
@@ -62,6 +66,8 @@ class MissingTorque(NamedTuple):
     command: np.ndarray
     load: np.ndarray
     torque: np.ndarray
+    ctrl: np.ndarray
+    drive: np.ndarray
 
 
 def missing_torque(model: mujoco.MjModel, recordings: Sequence[Recording]) -> MissingTorque:
@@ -73,7 +79,8 @@ def missing_torque(model: mujoco.MjModel, recordings: Sequence[Recording]) -> Mi
     """
     parts = [_of_span(model, r, slice(*span)) for r in recordings for span in r.spans]
     stacked = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
-    return MissingTorque(_dof_names(model), *stacked)
+    actuators = tuple(element_names(model, "actuator"))
+    return MissingTorque(_dof_names(model), actuators, *stacked)
 
 
 def localise(missing: MissingTorque) -> list[Place]:
@@ -152,12 +159,15 @@ def _of_span(model: mujoco.MjModel, recording: Recording, span: slice):
         mujoco.mj_inverse(model, data)
         needed, load = data.qfrc_inverse.copy(), data.qfrc_bias.copy()
         mujoco.mj_fwdActuation(model, data)
-        rows.append((needed, load, data.qfrc_actuator.copy()))
-    needed, load, given = (np.asarray(column) for column in zip(*rows, strict=True))
-    given = signal.savgol_filter(given, size, 2, axis=0)
+        drive = data.actuator_force * model.actuator_gear[:, 0]
+        rows.append((needed, load, data.qfrc_actuator.copy(), drive))
+    needed, load, given, drive = (np.asarray(column) for column in zip(*rows, strict=True))
+    both = signal.savgol_filter(np.hstack([given, drive]), size, 2, axis=0)
+    given, drive = both[:, : model.nv], both[:, model.nv :]
     position = _positions(model, recording.qpos[span])
     edge = slice(size // 2, len(time) - size // 2)
-    columns = (time, position, speed, acceleration, given, load, needed - given)
+    of_dofs = (time, position, speed, acceleration, given, load, needed - given)
+    columns = (*of_dofs, recording.ctrl[span], drive)
     return tuple(column[edge] for column in columns)
 
 

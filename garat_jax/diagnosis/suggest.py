@@ -1,4 +1,4 @@
-"""Sizes at which to try effects, as the torque that the model lacks suggests them."""
+"""Sizes at which to try effects, as recordings and the torque missing in them suggest."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ REVERSED = 0.05
 def suggest(
     effects: Sequence[Effect], host: mujoco.MjModel, recordings: Sequence[Recording]
 ) -> dict[int, Suggestion]:
-    """Ask each effect at a hinge or slide that may answer what the torque missing there suggests.
+    """Ask each effect at a hinge, slide or actuator what was missing or asked for there.
 
     Args:
         effects: The candidates.
@@ -27,34 +27,36 @@ def suggest(
     Returns:
         Suggestions by the effect's index.
     """
-    asked = {i: e.target.partition("/")[2] for i, e in enumerate(effects) if _may_answer(e)}
+    asked = {index: effect for index, effect in enumerate(effects) if _may_answer(effect)}
     if not asked:
         return {}
-    missing, found = missing_torque(host, recordings), {}
-    for index, name in asked.items():
-        if missing.dofs.count(name) != 1:
-            continue
-        dof = missing.dofs.index(name)
-        answers = [
-            effects[index].suggested(missing.position[:, dof], ripple)
-            for ripple in _ripples(missing, dof)
-        ]
-        kept = [answer for answer in answers if answer is not None]
-        if kept:
-            starts = tuple(start for answer in kept for start in answer.starts)
-            found[index] = Suggestion(starts, sum(answer.num_tried for answer in kept))
-    return found
+    missing = missing_torque(host, recordings)
+    answers = {index: _suggestion(effect, missing) for index, effect in asked.items()}
+    return {index: answer for index, answer in answers.items() if answer is not None}
 
 
 def _may_answer(effect: Effect) -> bool:
-    """Say whether an effect at a joint has suggestions at all."""
-    return effect.target.startswith("joint/") and (
-        type(effect).suggested.__func__ is not Effect.suggested.__func__
+    """Say whether an effect has suggestions at all."""
+    return any(
+        getattr(type(effect), name).__func__ is not getattr(Effect, name).__func__
+        for name in ("suggested", "suggested_by_commands")
     )
 
 
-def _ripples(m: MissingTorque, dof: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torque missing at a dof less what smooth laws and dry friction explain, [M] each.
+def _suggestion(effect: Effect, missing: MissingTorque) -> Suggestion | None:
+    """Return an effect's suggestion, None if it has none."""
+    element, _, name = effect.target.partition("/")
+    if element == "actuator":
+        at = missing.actuators.index(name)
+        return effect.suggested_by_commands(missing.ctrl[:, at], missing.drive[:, at])
+    if element != "joint" or missing.dofs.count(name) != 1:
+        return None
+    dof = missing.dofs.index(name)
+    return effect.suggested(missing.position[:, dof], _ripples(missing, dof))
+
+
+def _ripples(m: MissingTorque, dof: int) -> np.ndarray:
+    """Return the torque missing at a dof less what smooth laws and dry friction explain, [2, M].
 
     One is less what follows the command, too: a wrong gain would drown a ripple. In the other a
     controller's command, which fights the ripple and so has it, explains nothing of it. Of
@@ -71,8 +73,8 @@ def _ripples(m: MissingTorque, dof: int) -> tuple[np.ndarray, np.ndarray]:
         m.load[:, dof],
     ]
     torque = m.torque[:, dof][:, None]
-    first, second = (
+    rests = (
         without(torque, orthonormal(np.stack(columns, axis=1)))[:, 0]
         for columns in (laws, [*laws, m.command[:, dof]])
     )
-    return first, second
+    return np.stack(list(rests))

@@ -12,12 +12,18 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from garat_jax.effects.base import Effect, ModelView, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
 
 UNLIMITED = 1e9
 """Torque [N m] that stands for "no limit"."""
 PARTS_OF_RANGE = (0.9, 0.7, 0.5, 0.3)
-"""Parts of an actuator's largest torque or command at which laws with a threshold are tried."""
+"""Parts of an actuator's largest torque at which laws with a threshold are tried."""
+TIMES_BELOW = (0.3, 0.6, 0.85, 0.97)
+"""Parts of the recordings in which the model's torque stays below a limit that is tried."""
+FELT = 0.9
+"""A limit that is tried, of the torque that it is to cut: one at a held torque is not felt."""
+ALIKE = 1.1
+"""Ratio of two sizes within which a fit goes from one to the other by itself."""
 A_MOTOR = "an actuator whose force is its gain times the command"
 MINITAUR_CURVE = (
     (0.0, 0.0),
@@ -59,6 +65,15 @@ def largest_torque(host: mujoco.MjModel, actuator: str) -> float:
     if host.actuator_forcelimited[index]:
         force = min(force, float(np.abs(host.actuator_forcerange[index]).max()))
     return force * gear
+
+
+def limits_within(torque: np.ndarray) -> tuple[float, ...]:
+    """Return limits [N m], none alike, that cut a torque [M] in several parts of the time."""
+    limits: list[float] = []
+    for size in FELT * np.quantile(np.abs(torque), TIMES_BELOW):
+        if size > ALIKE * (limits[-1] if limits else 0.0):
+            limits.append(float(size))
+    return tuple(limits)
 
 
 def is_motor(host: mujoco.MjModel, actuator: str) -> bool:
@@ -139,6 +154,13 @@ class TorqueSaturation(Effect):
         """Try parts of the model's largest torque: above it the limit is never felt."""
         largest = largest_torque(host, target.partition("/")[2])
         return tuple({"limit": part * largest} for part in PARTS_OF_RANGE)
+
+    @classmethod
+    def suggested_by_commands(cls, command: np.ndarray, torque: np.ndarray) -> Suggestion | None:
+        """Try limits that the model goes beyond for several parts of the time."""
+        del command
+        limits = limits_within(torque)
+        return Suggestion(tuple({"limit": limit} for limit in limits), len(limits))
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Switch the limit of the force on, where the model has none at infinity."""
@@ -290,6 +312,14 @@ class MotorCurve(Effect):
             {"saturation": part * largest, "linear": 0.3 * part * largest}
             for part in (1.5, *PARTS_OF_RANGE)
         )
+
+    @classmethod
+    def suggested_by_commands(cls, command: np.ndarray, torque: np.ndarray) -> Suggestion | None:
+        """Try saturations that the model goes beyond for several parts of the time."""
+        del command
+        limits = limits_within(torque)
+        starts = ({"saturation": limit, "linear": 0.3 * limit} for limit in limits)
+        return Suggestion(tuple(starts), len(limits))
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
         """Command what gives the curve's torque under the model's linear law."""

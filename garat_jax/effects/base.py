@@ -249,16 +249,30 @@ class Effect(abc.ABC):
         return ({first.name: cls.at(host, target)[first.name] + first.scale},)
 
     @classmethod
-    def suggested(cls, position: np.ndarray, torque: np.ndarray) -> Suggestion | None:
+    def suggested(cls, position: np.ndarray, torques: np.ndarray) -> Suggestion | None:
         """Return sizes that the torque missing at its joint suggests, None if there are none.
 
         For laws with so many shapes that `starts` cannot list them.
 
         Args:
             position: Where the joint was measured, [M].
-            torque: What the model lacks there, [M].
+            torques: What the model lacks there, less what other laws may explain, in some ways,
+                [K, M].
         """
-        del position, torque
+        del position, torques
+        return None
+
+    @classmethod
+    def suggested_by_commands(cls, command: np.ndarray, torque: np.ndarray) -> Suggestion | None:
+        """Return sizes that what its actuator was asked for suggests, None if there are none.
+
+        For laws with a threshold, which `starts` can only place within what the model allows.
+
+        Args:
+            command: Of its actuator, along the recordings, [M].
+            torque: What the model's actuator gives at its joint for it, N m, [M].
+        """
+        del command, torque
         return None
 
     @classmethod

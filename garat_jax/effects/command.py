@@ -10,7 +10,10 @@ import numpy as np
 from flax import struct
 
 from garat_jax.effects.actuator import A_MOTOR, clamped, is_motor, largest_command
-from garat_jax.effects.base import Effect, ModelView, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+
+PARTS_OF_COMMAND = (0.01, 0.05, 0.2)
+"""Parts of the largest command at which a dead band is tried."""
 
 
 def _one_or_all(effect: Effect, host: mujoco.MjModel, ctrl: jax.Array, changed: jax.Array):
@@ -55,7 +58,15 @@ class MotorDeadband(Effect):
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
         """Try parts of the largest command: a band below the commands' sizes is a constant loss."""
         largest = largest_command(host, target.partition("/")[2])
-        return tuple({"width": part * largest} for part in (0.01, 0.05, 0.2))
+        return tuple({"width": part * largest} for part in PARTS_OF_COMMAND)
+
+    @classmethod
+    def suggested_by_commands(cls, command: np.ndarray, torque: np.ndarray) -> Suggestion | None:
+        """Try the same parts of the largest command that was given."""
+        del torque
+        largest = float(np.abs(command).max())
+        starts = tuple({"width": part * largest} for part in PARTS_OF_COMMAND if largest > 0)
+        return Suggestion(starts, len(starts))
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
         """Take the band out of the command."""

@@ -24,7 +24,7 @@ FINER = 4
 SMOOTH = 3
 """Degree of the polynomial of the angle that stands for other laws beside a ripple."""
 PEAKS = 2
-"""Ripples that are suggested: noise of fast motion may stand out more than a small one."""
+"""Ripples that each torque suggests: noise of fast motion may stand out more than a small one."""
 
 
 @struct.dataclass
@@ -218,8 +218,8 @@ class CoggingTorque(Effect):
         )
 
     @classmethod
-    def suggested(cls, position: np.ndarray, torque: np.ndarray) -> Suggestion | None:
-        """Return the ripples that stand out of the missing torque's spectrum over the angle.
+    def suggested(cls, position: np.ndarray, torques: np.ndarray) -> Suggestion | None:
+        """Return the ripples that stand out of the missing torques' spectra over the angle.
 
         Each is taken away before the next is looked for, or that were its sidelobe (Högbom 1974).
         Slower ripples than two periods in the range of the angle are hard to tell from other laws.
@@ -229,16 +229,18 @@ class CoggingTorque(Effect):
         low, high = max(periods.low, 4 * np.pi / max(span, 1e-9)), periods.high
         if low >= high:
             return None
-        starts, rest = [], torque
-        for _ in range(PEAKS):
-            peak = _highest_peak(position, rest, low, high)
-            if peak is None:
-                break
-            size, phase, _ = _wave(peak, position, rest)
-            rest = rest - size * np.sin(peak * position + phase)
-            size = min(size, amplitude.high)
-            starts.append({"amplitude": size, "periods": peak, "phase": phase})
-        return Suggestion(tuple(starts), math.ceil((high - low) * span / (2 * np.pi)))
+        starts = []
+        for rest in torques:
+            for _ in range(PEAKS):
+                peak = _highest_peak(position, rest, low, high)
+                if peak is None:
+                    break
+                size, phase, _ = _wave(peak, position, rest)
+                rest = rest - size * np.sin(peak * position + phase)
+                size = min(size, amplitude.high)
+                starts.append({"amplitude": size, "periods": peak, "phase": phase})
+        num_tried = len(torques) * math.ceil((high - low) * span / (2 * np.pi))
+        return Suggestion(tuple(starts), num_tried)
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
         """Add the torque at the present angle."""

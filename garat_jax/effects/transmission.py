@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 
 from garat_jax.effects.at_joint import actuator_torque, at_dof, feedback, is_driven
-from garat_jax.effects.base import Effect, ModelView, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
 
 RIGID = 1e9
 """Stiffness [N m/rad] that stands for "does not bend"."""
@@ -28,6 +28,8 @@ CONTACT = 0.5
 """Impulse per speed of contact in a substep, relative to the reduced inertia."""
 SPRING_SHARE = 0.25
 """Part of the contact's impulse per speed that is its spring's; the rest is damping."""
+PARTS_OF_TRAVEL = (0.01, 0.1)
+"""Parts of the way that a joint goes along the recordings at which play is tried."""
 NOWHERE = 1e9
 """Joint angle [rad] before the first substep: one that no joint has."""
 IMPLICIT = (
@@ -292,6 +294,14 @@ class Backlash(Transmission):
         """Try a new gear's play, a worn one's, and a loose one's."""
         del host, target
         return tuple({"gap": gap} for gap in (0.003, 0.015, 0.06))
+
+    @classmethod
+    def suggested(cls, position: np.ndarray, torques: np.ndarray) -> Suggestion | None:
+        """Try parts of the joint's travel: a gap beyond it is never crossed, and a slide has m."""
+        del torques
+        travel, most = float(np.ptp(position)), cls.parameters()[0].high
+        gaps = [part * travel for part in PARTS_OF_TRAVEL if 0 < part * travel < most]
+        return Suggestion(tuple({"gap": gap} for gap in gaps), len(gaps))
 
     @property
     def active(self) -> jax.Array:

@@ -10,6 +10,7 @@ from garat_jax import dynamics
 from garat_jax.effects import (
     ActuatorLag,
     BackEmf,
+    Backlash,
     Effect,
     JointStiffness,
     MotorCurve,
@@ -130,3 +131,33 @@ def test_laws_with_a_threshold_start_within_the_range_of_the_model():
     assert max(limits) < 6.0  # gear 2, commands up to 3
     assert len(limits) > 2
     assert all(0 < s["width"] < 3.0 for s in MotorDeadband.starts(host, MOTOR))
+
+
+@pytest.mark.parametrize("cls", [TorqueSaturation, MotorCurve])
+def test_limits_are_suggested_within_the_torque_that_the_recordings_ask_for(cls):
+    rng = np.random.default_rng(0)
+    torque = rng.normal(size=5000)  # beyond 1.64 in 10 % of the samples
+    limits = [next(iter(s.values())) for s in cls.suggested_by_commands(torque / 70, torque).starts]
+    shares = [float(np.mean(np.abs(torque) > limit)) for limit in limits]
+    assert min(shares) < 0.1 < max(shares)
+    assert max(shares) > 0.6
+    held = cls.suggested_by_commands(np.ones(100), np.full(100, -2.0))
+    assert len(held.starts) == held.num_tried == 1
+    assert 1.5 < next(iter(held.starts[0].values())) < 2.0
+    assert cls.suggested_by_commands(np.zeros(9), np.zeros(9)).starts == ()
+
+
+def test_dead_bands_are_suggested_within_the_commands():
+    small = 0.02 * np.sin(np.arange(1000.0))
+    widths = [s["width"] for s in MotorDeadband.suggested_by_commands(small, 2 * small).starts]
+    assert len(widths) > 2
+    assert all(0 < width < 0.5 * 0.02 for width in widths)
+    assert MotorDeadband.suggested_by_commands(np.zeros(9), np.zeros(9)).starts == ()
+
+
+def test_play_is_suggested_within_the_travel():
+    travel = 0.004 * np.sin(np.arange(1000.0))
+    gaps = [s["gap"] for s in Backlash.suggested(travel, travel).starts]
+    assert len(gaps) == 2
+    assert all(0 < gap < 0.004 for gap in gaps)
+    assert Backlash.suggested(np.full(9, 0.3), np.zeros(9)).starts == ()
