@@ -8,6 +8,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from garat_jax.types import Number
+
 
 def forward(network: nn.Module, weights: Any, inputs: jax.Array) -> Any:
     """Apply a network; Flax's `apply` may also return variables, which none of ours has."""
@@ -51,7 +53,7 @@ class GaussianPolicy(nn.Module):
 
     size: int
     hidden: Sequence[int]
-    initial_log_std: float = 0.0
+    initial_log_std: Number = 0.0
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> distrax.MultivariateNormalDiag:

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import jax
 
 Metrics = dict[str, jax.Array]
+Number = Any
+"""A hyper-parameter: a float, or an array [] that `vmap` varies."""
 Params = Any
 """A pytree of arrays that defines an environment, a network or both."""
 

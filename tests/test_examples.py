@@ -46,6 +46,13 @@ def test_user_effect():
     assert sized.error_after < 0.5 * sized.error_before
 
 
+def test_sweep(capsys):
+    lengths = run("05_sweep.py")["lengths"]
+    assert lengths.shape == (3, 4, 15)
+    assert lengths[1:, :, -1].mean() > 3 * lengths[0, :, -1].mean()
+    assert "KL at most 0.01: " in capsys.readouterr().out
+
+
 def test_an_own_effect_takes_under_30_lines():
     text = (EXAMPLES / "my_effects.py").read_text(encoding="utf-8")
     assert sum(bool(line.strip()) for line in text.splitlines()) < 30

@@ -1,5 +1,6 @@
 """What TRPO and PPO share: their state, their policy, and how they collect a batch."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,12 @@ from garat_jax.env import Env, EnvState
 from garat_jax.networks import GaussianPolicy, ValueNet, forward
 from garat_jax.rollout import Fault
 from garat_jax.shuffle import shuffled
-from garat_jax.types import Params, Policy, Transition
+from garat_jax.types import Number, Params, Policy, Transition
+
+
+def static(default: Any) -> Any:
+    """Declare a setting that decides shapes or loops, which `vmap` cannot vary."""
+    return dataclasses.field(default=default, metadata={"static": True})
 
 
 class PolicyParams(NamedTuple):
@@ -118,8 +124,8 @@ def prepare(
     value: ValueNet,
     state: ActorCriticState,
     transitions: Transition,
-    discount: float,
-    trace: float,
+    discount: Number,
+    trace: Number,
 ) -> Batch:
     """Estimate advantages and flatten the batch; observations come out normalised."""
     obs, next_obs = normalise(state.policy, jnp.stack([transitions.obs, transitions.next_obs]))

@@ -3,15 +3,15 @@
 import jax
 import jax.numpy as jnp
 
-from garat_jax.types import Transition
+from garat_jax.types import Number, Transition
 
 
 def gae(
     transitions: Transition,
     value: jax.Array,
     next_value: jax.Array,
-    discount: float,
-    trace: float,
+    discount: Number,
+    trace: Number,
 ) -> tuple[jax.Array, jax.Array]:
     """Estimate advantages and value targets (Schulman et al. 2016, arXiv 1506.02438, eq. 16).
 

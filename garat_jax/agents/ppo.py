@@ -8,33 +8,38 @@ import jax.numpy as jnp
 import optax
 
 from garat_jax.agents import actor_critic
-from garat_jax.agents.actor_critic import ActorCriticState, Batch
+from garat_jax.agents.actor_critic import ActorCriticState, Batch, static
 from garat_jax.env import Env
 from garat_jax.networks import GaussianPolicy, ValueNet, forward
-from garat_jax.types import Agent, Params
+from garat_jax.types import Agent, Number, Params
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
     """Hyper-parameters; the defaults are Desai et al. 2020, appendix, action transformer."""
 
-    num_envs: int = 50
-    num_steps: int = 100  # 50 x 100 = 5000 steps a batch, as the paper
-    hidden: tuple[int, ...] = (64, 64)
-    initial_log_std: float = 0.0
-    num_epochs: int = 1
-    num_minibatches: int = 2
-    learning_rate: float = 3e-4
-    discount: float = 0.99
-    trace: float = 0.95
-    clip: float = 0.1
-    value_weight: float = 0.5  # stable-baselines PPO2
-    entropy_weight: float = 0.0
-    max_grad_norm: float = 0.5  # stable-baselines PPO2
+    num_envs: int = static(50)
+    num_steps: int = static(100)  # 50 x 100 = 5000 steps a batch, as the paper
+    hidden: tuple[int, ...] = static((64, 64))
+    initial_log_std: Number = 0.0
+    num_epochs: int = static(1)
+    num_minibatches: int = static(2)
+    learning_rate: Number = 3e-4
+    discount: Number = 0.99
+    trace: Number = 0.95
+    clip: Number = 0.1
+    value_weight: Number = 0.5  # stable-baselines PPO2
+    entropy_weight: Number = 0.0
+    max_grad_norm: Number = 0.5  # stable-baselines PPO2
 
 
 def make(env: Env, config: PPOConfig) -> Agent:
-    """Build a PPO agent for an environment."""
+    """Build a PPO agent for an environment.
+
+    The config's numbers are leaves: a function that is given some, builds an agent with them and
+    trains it can be mapped over them by `jax.vmap`, as over seeds (`examples/05_sweep.py`).
+    """
     policy_net = GaussianPolicy(env.action_size, config.hidden, config.initial_log_std)
     value_net = ValueNet(config.hidden)
     policy, mean = actor_critic.make_policy(policy_net)

@@ -11,34 +11,39 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from garat_jax.agents import actor_critic
-from garat_jax.agents.actor_critic import ActorCriticState, Batch
+from garat_jax.agents.actor_critic import ActorCriticState, Batch, static
 from garat_jax.env import Env
 from garat_jax.networks import GaussianPolicy, ValueNet, forward
-from garat_jax.types import Agent, Params
+from garat_jax.types import Agent, Number, Params
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TRPOConfig:
     """Hyper-parameters; the defaults are Desai et al. 2020, appendix, agent policy."""
 
-    num_envs: int = 50
-    num_steps: int = 100  # 50 x 100 = 5000 steps a batch, as the paper
-    hidden: tuple[int, ...] = (64, 64)
-    initial_log_std: float = 0.0
-    max_kl: float = 0.01
-    discount: float = 0.995
-    trace: float = 0.97
-    cg_damping: float = 0.1
-    cg_iterations: int = 20
-    fisher_share: float = 1.0  # of the batch; stable-baselines TRPO takes every fifth sample
-    line_search_steps: int = 10  # stable-baselines TRPO
-    value_learning_rate: float = 1e-3
-    value_epochs: int = 5
-    value_minibatch: int = 128  # stable-baselines TRPO
+    num_envs: int = static(50)
+    num_steps: int = static(100)  # 50 x 100 = 5000 steps a batch, as the paper
+    hidden: tuple[int, ...] = static((64, 64))
+    initial_log_std: Number = 0.0
+    max_kl: Number = 0.01
+    discount: Number = 0.995
+    trace: Number = 0.97
+    cg_damping: Number = 0.1
+    cg_iterations: int = static(20)
+    fisher_share: float = static(1.0)  # of the batch; stable-baselines takes every fifth sample
+    line_search_steps: int = static(10)  # stable-baselines TRPO
+    value_learning_rate: Number = 1e-3
+    value_epochs: int = static(5)
+    value_minibatch: int = static(128)  # stable-baselines TRPO
 
 
 def make(env: Env, config: TRPOConfig) -> Agent:
-    """Build a TRPO agent for an environment."""
+    """Build a TRPO agent for an environment.
+
+    The config's numbers are leaves: a function that is given some, builds an agent with them and
+    trains it can be mapped over them by `jax.vmap`, as over seeds (`examples/05_sweep.py`).
+    """
     policy_net = GaussianPolicy(env.action_size, config.hidden, config.initial_log_std)
     value_net = ValueNet(config.hidden)
     policy, mean = actor_critic.make_policy(policy_net)
@@ -182,7 +187,7 @@ def fisher_vector_product(
     flat: jax.Array,
     unflatten: Callable[[jax.Array], Params],
     obs: jax.Array,
-    damping: float,
+    damping: Number,
 ) -> Callable[[jax.Array], jax.Array]:
     """Return v -> (F + damping I) v, with F the policy's mean Fisher information.
 

@@ -1,5 +1,6 @@
 """Both agents learn what each probe environment isolates, whatever way they are run."""
 
+import dataclasses
 import functools
 
 import jax
@@ -38,6 +39,11 @@ AGENTS = {
         ),
     ),
 }
+CONFIGS = {
+    "ppo": PPOConfig(**SHARED, num_epochs=2, num_minibatches=2),
+    "trpo": TRPOConfig(**SHARED, cg_iterations=5, value_minibatch=64),
+}
+MAKE = {"ppo": ppo.make, "trpo": trpo.make}
 ALGORITHMS = pytest.mark.parametrize("algorithm", AGENTS)
 
 
@@ -131,3 +137,32 @@ def test_a_step_counts_steps_and_episodes(algorithm):
     assert state.env_steps == 512
     np.testing.assert_array_equal(metrics["episode_length"][:2], [2, 2])
     np.testing.assert_array_equal(metrics["reward"][:2], [0.5, 0.5])
+
+
+@ALGORITHMS
+def test_a_setting_in_a_sweep_is_that_setting_alone(algorithm):
+    base = CONFIGS[algorithm]
+    numbers = [f.name for f in dataclasses.fields(base) if not f.metadata.get("static")]
+    assert {"discount", "trace", "initial_log_std"} < set(numbers)
+    swept = [base] + [
+        dataclasses.replace(base, **{name: 0.7 * getattr(base, name) + 0.01}) for name in numbers
+    ]
+
+    def learn(config, key):
+        agent = MAKE[algorithm](AnyProbe(), config)
+        state, probe = agent.init(key, 0), list(PROBES).index("delayed reward")
+        state, metrics = jax.lax.scan(lambda s, _: agent.step(s, probe)[:2], state, length=2)
+        return jax.flatten_util.ravel_pytree((state.policy.weights, state.value))[0], metrics
+
+    key = jax.random.key(0)
+    stacked = jax.tree.map(lambda *values: jnp.asarray(values), *swept)
+    together, metrics = jax.jit(jax.vmap(learn, (0, None)))(stacked, key)
+    one = jax.jit(learn)
+    for i, config in enumerate(swept):
+        weights, alone = one(config, key)
+        np.testing.assert_allclose(together[i], weights, rtol=2e-3, atol=2e-4)
+        jax.tree.map(
+            lambda m, a, i=i: np.testing.assert_allclose(m[i], a, atol=2e-3), metrics, alone
+        )
+    assert one._cache_size() == 1  # another number is no other program
+    assert len(np.unique(together.round(5), axis=0)) > len(numbers) / 2  # and numbers matter
