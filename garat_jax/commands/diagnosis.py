@@ -93,12 +93,17 @@ class Compare(OnRecordings):
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnose(WithHoldout):
-    """Find where a model fails and which physical effect it is missing."""
+class WithConditions(WithHoldout):
+    """The same, with recordings that were made under other conditions."""
 
     condition: Annotated[tuple[str, ...], arg(metavar="NAME=FILE...")] = ()
     """Recordings under other conditions, such as with a payload: what DATA shows is shared by all,
-    what these show besides is theirs."""
+    what these show besides is theirs, and so is a model card, DIR/model-NAME.toml."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnose(WithConditions):
+    """Find where a model fails and which physical effect it is missing."""
 
     def run(self) -> None:
         """Diagnose the model."""
@@ -117,20 +122,22 @@ def parse_conditions(given: Sequence[str]) -> dict[str, list[Path]]:
     """Read NAME=FILE words into the files of each condition.
 
     Raises:
-        UserError: A word is no NAME=FILE, or there is no such file.
+        UserError: A word is no NAME=FILE, the name is none for a file, or there is no such file.
     """
     conditions: dict[str, list[Path]] = {}
     for word in given:
         name, equals, file = word.partition("=")
         if not (name and equals and file):
             raise UserError(f"--condition: {word!r} is not NAME=FILE, as in loaded=run3.csv")
+        if Path(name).name != name:
+            raise UserError(f"--condition: {name!r} names a file, so it may hold no folder")
         check_files([Path(file)], "--condition")
         conditions.setdefault(name, []).append(Path(file))
     return conditions
 
 
 @dataclasses.dataclass(frozen=True)
-class Improve(WithHoldout):
+class Improve(WithConditions):
     """Repair a model: diagnose, add what is missing, repeat until nothing more is certain.
 
     It writes DIR/model.toml with the model's files beside it, DIR/improve.json and DIR/report.html.
@@ -139,12 +146,15 @@ class Improve(WithHoldout):
     def run(self) -> None:
         """Repair the model."""
         self.check()
+        conditions = parse_conditions(self.condition)
         from garat_jax.diagnosis.improve import run_improve
         from garat_jax.effects.catalogue import load_catalogue
 
         catalogue = load_catalogue(self.effects)
         with make_run(self, self.folder("improve")) as run:
-            done = run_improve(self.model, self.data, self.holdout, run, self.map, catalogue)
+            done = run_improve(
+                self.model, self.data, self.holdout, run, self.map, catalogue, conditions
+            )
         say(str(done))
         say(f"model card: {run.root / 'model.toml'} {done.card}")
         say(f"report: {run.root / 'report.html'}")

@@ -7,24 +7,27 @@ effect of another size. At the end all parameters are fitted to all recordings.
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
+from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.diagnose import UNEXPLAINED, diagnose, split, thin
 from garat_jax.diagnosis.fit import count_timestep, fit
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.model_card import Model, save_card
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Candidate, Diagnosis
 from garat_jax.diagnosis.segments import Segments, choose_grid
 from garat_jax.diagnosis.simulate import Simulator, Slot
-from garat_jax.diagnosis.view import as_effects
+from garat_jax.diagnosis.view import as_effects, repaired
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
+from garat_jax.runs import RunDirectory
 
 
 def diagnose_conditions(
@@ -51,6 +54,21 @@ def diagnose_conditions(
         of each condition by itself.
     """
     base = diagnose(model, recordings, holdout, say)
+    return add_conditions(model, base, recordings, conditions, holdout, say)
+
+
+def add_conditions(
+    model: Model,
+    base: Diagnosis,
+    recordings: Sequence[Recording],
+    conditions: Mapping[str, Sequence[Recording]],
+    holdout: Sequence[Recording] = (),
+    say: Callable[[str], None] = lambda message: None,
+) -> Diagnosis:
+    """Find what changes from the base condition, whose diagnosis is given, to others.
+
+    Args and result are those of `diagnose_conditions`.
+    """
     shared = as_effects(model, base.selected)
     found = {}
     for name, measured in conditions.items():
@@ -64,6 +82,27 @@ def diagnose_conditions(
         base, *others = _fit_together(model, fitted, together)
         found |= dict(zip(clear, others, strict=True))
     return dataclasses.replace(base, conditions=found)
+
+
+def read_conditions(
+    model: Model, conditions: Mapping[str, Sequence[Path]] | None, columns: Path | None = None
+) -> dict[str, tuple[Recording, ...]]:
+    """Read the recordings of each condition; see `read_recordings`."""
+    named = (conditions or {}).items()
+    return {name: tuple(read_recordings(model, paths, columns)) for name, paths in named}
+
+
+def write_cards(run: RunDirectory, model: Model, found: Diagnosis) -> None:
+    """Write what was found as model.toml, and model-CONDITION.toml for each other condition.
+
+    Args:
+        run: Where to write.
+        model: The model that was diagnosed, its MJCF in the run's folder.
+        found: Its diagnosis.
+    """
+    save_card(run.path("model.toml"), repaired(model, found.selected))
+    for name in found.conditions:
+        save_card(run.path(f"model-{name}.toml"), repaired(model, found.under(name)))
 
 
 def _is_clear(found: Diagnosis) -> bool:

@@ -1,24 +1,28 @@
 """Repair a model: diagnose, add what was found, repeat until nothing passes the gates."""
 
 import dataclasses
+import html
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import plotly.graph_objects as go
 
 from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
+from garat_jax.diagnosis.conditions import add_conditions, read_conditions, write_cards
 from garat_jax.diagnosis.diagnose import diagnose, is_explained, metric_in_words, split, thin
 from garat_jax.diagnosis.export import copy_model
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric, noise_floor
-from garat_jax.diagnosis.model_card import Model, load_model, save_card
+from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import progress
 from garat_jax.diagnosis.repeat import found_theta, nominal_effects, repeatability
 from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosis_sections
+from garat_jax.diagnosis.report_conditions import condition_sections
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
@@ -60,7 +64,15 @@ class Improvement:
         for rung in self.diagnosis.ladder:
             added = self.diagnosis.added(rung)
             lines.append(f"  {added}: held-out error {rung.error_holdout:.4g}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *self.diagnosis.other_conditions])
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return f"<pre>{html.escape(str(self))}</pre>"
+
+    def plot(self, what: str = "ladder") -> go.Figure:
+        """Draw the `ladder` of errors over all rounds, or what `Diagnosis.plot` draws besides."""
+        return self.diagnosis.plot(what)
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of improve.json."""
@@ -71,6 +83,7 @@ class Improvement:
             **{key: whole[key] for key in kept},
             "added": whole["selected"],
             "repeatability": whole["repeatability"],
+            "conditions": whole["conditions"],
             "rounds": [found.to_json() for found in self.rounds],
             "seconds": sum(found.seconds for found in self.rounds),
         }
@@ -81,6 +94,7 @@ def improve(
     recordings: Sequence[Recording],
     holdout: Sequence[Recording] = (),
     say: Callable[[str], None] = lambda message: None,
+    conditions: Mapping[str, Sequence[Recording]] | None = None,
 ) -> Improvement:
     """Add effects to a model until no further one passes the gates of a diagnosis.
 
@@ -89,6 +103,8 @@ def improve(
         recordings: What was measured.
         holdout: Recordings to prove the result on; see `diagnose`.
         say: Told what is being done.
+        conditions: Recordings made under other conditions, by name; what they show besides is found
+            once the model of the base condition is whole. See `diagnose_conditions`.
     """
     current, rounds = model, []
     for number in range(ROUNDS):
@@ -105,8 +121,10 @@ def improve(
     added = tuple(c for found in rounds for c in found.selected)
     say("measuring the ladder")
     whole = _as_one(model, recordings, holdout, rounds, added)
-    again = repeatability(model, recordings, holdout, added, say)
-    return Improvement(dataclasses.replace(whole, repeatability=again), tuple(rounds), current)
+    if conditions:
+        whole = add_conditions(model, whole, recordings, conditions, holdout, say)
+    whole = repeatability(model, whole, recordings, holdout, conditions, say)
+    return Improvement(whole, tuple(rounds), repaired(model, whole.selected))
 
 
 def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -> Diagnosis:
@@ -186,10 +204,12 @@ def run_improve(
     run: RunDirectory,
     columns: Path | None = None,
     catalogue: Catalogue = CATALOGUE,
+    conditions: Mapping[str, Sequence[Path]] | None = None,
 ) -> Improvement:
     """Repair a model file with recordings; write model.toml, improve.json and report.html.
 
-    The model's own files are copied into `model/`, so that the run's folder is complete.
+    The model's own files are copied into `model/`, so that the run's folder is complete. Each other
+    condition has a card of its own, model-CONDITION.toml.
 
     Args:
         model: MJCF or model card.
@@ -198,19 +218,22 @@ def run_improve(
         run: Where to write.
         columns: Map of the recordings' columns.
         catalogue: The kinds of effect that may be missing.
+        conditions: Recordings made under other conditions than `data`, by the condition's name.
 
     Raises:
         UserError: A file cannot be read, does not fit the model, or cannot be copied.
     """
     loaded = load_model(model, catalogue)
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
+    others = read_conditions(loaded, conditions, columns)
     copied = copy_model(loaded, run.path("model"))
     with progress("looking at the recordings") as say:
-        done = improve(loaded, recordings, held_out, say)
+        done = improve(loaded, recordings, held_out, say, others)
         run.write_json("improve.json", finite_or_null(to_plain(done.to_json())))
-        save_card(run.path("model.toml"), dataclasses.replace(done.model, mjcf=copied))
+        write_cards(run, dataclasses.replace(loaded, mjcf=copied), done.diagnosis)
         say("writing the report")
         sections = diagnosis_sections(done.diagnosis, loaded, recordings, held_out)
+        sections += condition_sections(done.diagnosis, loaded, others)
     report.write(
         run.path("report.html"),
         kind="A model repaired from measurements",

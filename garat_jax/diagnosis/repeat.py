@@ -1,24 +1,36 @@
-"""Is an effect the same in every recording? Each is fitted alone, and the sizes are compared."""
+"""Is an effect the same in every recording? Each is fitted alone, and the sizes are compared.
 
-from collections.abc import Callable, Sequence
+Whether it is this effect that each recording needs is told too: by how much the error falls there,
+and by the rivals that promise more.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
-from garat_jax.diagnosis.diagnose import split, thin
+from garat_jax.diagnosis.diagnose import make_candidates, split, thin
 from garat_jax.diagnosis.fit import count_timestep, fit
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
+from garat_jax.diagnosis.judge import TOO_CLOSE
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Candidate, Repeated, Sighting
+from garat_jax.diagnosis.results import Candidate, Diagnosis, Named, Repeated, Sighting
+from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
-from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.starts import Fit, settle
+from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
 
 SIGNIFICANCE = 0.01
 """Smallest p-value of equal sizes (Cochran's Q) at which recordings still count as agreeing."""
+NUM_RIVALS = 3
+"""Effects that a recording may need instead; scores of a few take less time than the fits."""
 
 
 def nominal_effects(model: Model, selected: Sequence[Candidate]) -> tuple[Effect, ...]:
@@ -31,10 +43,10 @@ def nominal_effects(model: Model, selected: Sequence[Candidate]) -> tuple[Effect
 
 
 def found_theta(simulator: Simulator, selected: Sequence[Candidate]) -> np.ndarray:
-    """Return the parameters that a diagnosis found, [num_parameters]."""
+    """Return the parameters that a diagnosis found, [num_parameters]; more effects have no size."""
     theta = simulator.base.copy()
     for j, slot in enumerate(simulator.slots):
-        estimates = selected[slot.effect].parameters
+        estimates = selected[slot.effect].parameters if slot.effect < len(selected) else {}
         if slot.parameter.name in estimates:
             theta[j] = estimates[slot.parameter.name].estimate
     return theta
@@ -42,26 +54,66 @@ def found_theta(simulator: Simulator, selected: Sequence[Candidate]) -> np.ndarr
 
 def repeatability(
     model: Model,
+    found: Diagnosis,
     recordings: Sequence[Recording],
-    holdout: Sequence[Recording],
-    selected: Sequence[Candidate],
+    holdout: Sequence[Recording] = (),
+    conditions: Mapping[str, Sequence[Recording]] | None = None,
     say: Callable[[str], None] = lambda message: None,
-) -> tuple[Repeated, ...]:
-    """Fit the effects that a diagnosis found to each recording alone.
+) -> Diagnosis:
+    """Return a diagnosis with what each recording alone shows of the effects that it found.
+
+    A shared effect is looked for in the recordings of every condition that has no other one in
+    its place, and a condition's own effects in its own.
+
+    Args:
+        model: The model without the effects.
+        found: The diagnosis.
+        recordings: Those that it was given.
+        holdout: Those that it was given to hold out.
+        conditions: Those of other conditions that it was given.
+        say: Told what is being done.
+    """
+    seen = _alone(model, split(recordings, holdout), found.selected, found.candidates, say)
+    others = {}
+    for name, other in found.conditions.items():
+        own = {c.named for c in other.selected}
+        measured = split((conditions or {})[name], ())
+        rivals = (*other.candidates, *found.candidates)
+        there = _alone(model, measured, found.under(name), rivals, say)
+        for parameter in seen:
+            if parameter.of not in own:
+                seen[parameter] += there[parameter]
+        mine = {p: sightings for p, sightings in there.items() if p.of in own}
+        others[name] = dataclasses.replace(other, repeatability=_summaries(mine))
+    return dataclasses.replace(found, repeatability=_summaries(seen), conditions=others)
+
+
+class _Parameter(NamedTuple):
+    """A parameter of an effect that was found."""
+
+    of: Named
+    name: str
+    unit: str
+
+
+def _alone(
+    model: Model, parts, selected: Sequence[Candidate], candidates: Sequence[Candidate], say
+) -> dict[_Parameter, list[Sighting]]:
+    """Fit the effects selected to each recording alone.
 
     Args:
         model: The model without them.
-        recordings: Those that the diagnosis was given.
-        holdout: Those that it was given to hold out.
-        selected: What it found.
+        parts: What `split` returned.
+        selected: All effects that act in these recordings.
+        candidates: Best first; the first of them that were not selected are the rivals.
         say: Told what is being done.
     """
-    fitted, held_out, _ = split(recordings, holdout)
-    everything = thin((*fitted, *held_out))
     if not selected:
-        return ()
-    grid = choose_grid(everything, model.compile(engine="mujoco").host.model.opt.timestep)
-    effects = nominal_effects(model, selected)
+        return {}
+    everything = thin((*parts[0], *parts[1]))
+    host = native_model(model.compile(engine="mujoco"))
+    grid = choose_grid(everything, host.opt.timestep)
+    effects = (*nominal_effects(model, selected), *_rivals(model, host, selected, candidates))
     simulator = Simulator(model, effects, grid)
     finer = Simulator(model, effects, grid, refine=2)
     theta = found_theta(simulator, selected)
@@ -69,35 +121,69 @@ def repeatability(
     sample = grid.interval * grid.per_sample
     everywhere = np.ones(len(segments.start), bool)
     whole = Problem(simulator, finer, segments, everywhere, sample)
-    free = [
-        j
+    free = {
+        j: _Parameter(selected[slot.effect].named, slot.parameter.name, estimate.unit)
         for j, slot in enumerate(simulator.slots)
-        if np.isfinite(_half_width(selected[slot.effect], slot.parameter.name))
-    ]
+        if slot.effect < len(selected)
+        and (estimate := selected[slot.effect].parameters.get(slot.parameter.name))
+        and np.isfinite(estimate.high - estimate.low)
+    }
     longer = cut_longer(whole, everything, grid, theta)
     whole, settled = longer or (whole, settle(whole, theta, segments.start))
-    sightings: dict[int, list[Sighting]] = {j: [] for j in free}
+    sightings: dict[_Parameter, list[Sighting]] = {parameter: [] for parameter in free.values()}
     for index, recording in enumerate(everything):
         say(f"fitting {recording.name} alone")
         own = whole.segments.recording == index
         alone = whole.take(own)
-        found = count_timestep(alone, fit(alone, theta, settled.start[own], free))
-        for place, j in enumerate(free):
-            seen = j not in found.frozen
-            numbers = (found.theta[j], found.low[place], found.high[place])
-            values = [float(v) if seen else float("nan") for v in numbers]
-            sightings[j].append(Sighting(recording.name, *values))
-    return tuple(_summary(simulator, selected, j, sightings[j]) for j in free)
+        fitted = count_timestep(alone, fit(alone, theta, settled.start[own], free))
+        needs = [_need(alone, fitted, number, len(selected)) for number in range(len(selected))]
+        for place, (j, parameter) in enumerate(free.items()):
+            seen = j not in fitted.frozen
+            numbers = (fitted.theta[j], fitted.low[place], fitted.high[place])
+            estimate, low, high = (float(v) if seen else float("nan") for v in numbers)
+            need = needs[simulator.slots[j].effect]
+            sightings[parameter].append(Sighting(recording.name, estimate, low, high, *need))
+    return sightings
 
 
-def _half_width(candidate: Candidate, name: str) -> float:
-    estimate = candidate.parameters.get(name)
-    return float("nan") if estimate is None else 0.5 * (estimate.high - estimate.low)
+def _rivals(model: Model, host, selected, candidates) -> list[Effect]:
+    """Return the best candidates that these recordings can tell from all selected, of no size."""
+    taken = {c.named for c in selected}
+    taken |= {named for c in selected for named in c.indistinguishable_from}
+    best = dict.fromkeys(c.named for c in candidates if c.named not in taken)
+    places = list(best)[:NUM_RIVALS]
+    offered = {Named(e.kind, e.target): e for e in make_candidates(model, host)}
+    return [offered[place] for place in places if place in offered]
 
 
-def _summary(simulator: Simulator, selected, j: int, seen: list[Sighting]) -> Repeated:
-    slot = simulator.slots[j]
-    candidate = selected[slot.effect]
+def _need(
+    alone: Problem[Simulator], fitted: Fit, effect: int, num_selected: int
+) -> tuple[float, float, tuple[Named, ...]]:
+    """Return the errors without and with an effect, and which rivals explain more.
+
+    A rival explains what its sensitivity promises, as in the scoring of candidates; it is ahead if
+    that leaves clearly less of the squared residual than the effect does.
+    """
+    simulator = alone.simulator
+    owners = np.asarray([slot.effect for slot in simulator.slots])
+    nothing = np.where(owners == effect, simulator.base, fitted.theta)
+    without = settle(alone, nothing, fitted.start)
+    metric, chosen = make_metric(dataclasses.replace(alone, fitted=~alone.fitted)), alone.fitted
+    left = fitted.cost.sum() / without.cost.sum()
+    ahead = tuple(
+        Named(rival.kind, rival.target)
+        for score in screen(alone, without, range(num_selected))
+        if score.possible and not score.excluded and (1.0 - score.share) * TOO_CLOSE < left
+        for rival in [simulator.effects[score.effect]]
+    )
+    return metric.error(without.residual, chosen), metric.error(fitted.residual, chosen), ahead
+
+
+def _summaries(sightings: Mapping[_Parameter, list[Sighting]]) -> tuple[Repeated, ...]:
+    return tuple(_summary(parameter, seen) for parameter, seen in sightings.items())
+
+
+def _summary(parameter: _Parameter, seen: list[Sighting]) -> Repeated:
     usable = [s for s in seen if np.isfinite([s.estimate, s.low, s.high]).all()]
     sizes = np.asarray([s.estimate for s in usable])
     errors = np.asarray([max(s.high - s.low, 1e-300) / 3.92 for s in usable])
@@ -107,10 +193,10 @@ def _summary(simulator: Simulator, selected, j: int, seen: list[Sighting]) -> Re
         mean = float(weight @ sizes / weight.sum())
         p_value = float(stats.chi2.sf(float(weight @ (sizes - mean) ** 2), len(sizes) - 1))
     return Repeated(
-        effect=candidate.effect,
-        target=candidate.target,
-        parameter=slot.parameter.name,
-        unit=candidate.parameters[slot.parameter.name].unit,
+        effect=parameter.of.effect,
+        target=parameter.of.target,
+        parameter=parameter.name,
+        unit=parameter.unit,
         recordings=tuple(seen),
         p_value=p_value,
         agree=p_value >= SIGNIFICANCE,

@@ -120,14 +120,14 @@ def diagnosis_sections(
     view = look(model, everything, range(len(fitted), len(everything)), diagnosis.selected)
     return [
         _errors(diagnosis.error, view),
-        _traces(view),
+        traces(view),
         *_where(diagnosis.where, view),
         *_ranking(diagnosis),
         *_ladder(diagnosis),
         *_parameters(diagnosis, model),
         *conditions_section(diagnosis),
         *drift_section(diagnosis.drifts),
-        *repeatability_section(diagnosis.repeatability),
+        *repeatability_section(diagnosis),
         *_next(diagnosis),
         *_left(diagnosis, view),
     ]
@@ -155,7 +155,7 @@ def write_comparison(
         sections=[
             *side_by_side_section(comparison),
             _errors(error, view),
-            _traces(view),
+            traces(view),
             residuals_section(
                 comparison.residuals,
                 comparison.residuals.sentence(comparison.near_noise),
@@ -224,7 +224,8 @@ def _errors(error: Errors, view: View) -> Section:
     )
 
 
-def _traces(view: View) -> Section:
+def traces(view: View) -> Section:
+    """Return the section that shows predictions beside the measurements."""
     before = view.before[view.middle]
     after = view.after[view.middle] if view.after else None
     order = before.worst(len(before.segments.first))

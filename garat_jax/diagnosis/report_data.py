@@ -8,7 +8,7 @@ import plotly.graph_objects as go
 
 from garat_jax.diagnosis.quality import Quality
 from garat_jax.diagnosis.residuals import Residuals
-from garat_jax.diagnosis.results import Diagnosis, Drift, Repeated
+from garat_jax.diagnosis.results import Diagnosis, Drift, Named, Repeated
 from garat_jax.diagnosis.torque import TorqueError
 from garat_jax.report import COLOURS, SOFT, Figure, Section, Table, styled
 
@@ -156,25 +156,32 @@ def torque_section(torques: Sequence[TorqueError]) -> list[Section]:
     ]
 
 
-def repeatability_section(repeated: Sequence[Repeated]) -> list[Section]:
-    """Return whether each recording alone shows the same size; nothing without an effect."""
-    if not repeated:
+def repeatability_section(diagnosis: Diagnosis) -> list[Section]:
+    """Return whether each recording alone shows the same effect and size; nothing without any."""
+    found = [(r, "") for r in diagnosis.repeatability]
+    for name, other in diagnosis.conditions.items():
+        found += [(r, f" ({name})") for r in other.repeatability]
+    if not found:
         return []
     rows = [
         (
-            f"{r.effect.replace('_', ' ')} at {r.target}",
+            f"{r.effect.replace('_', ' ')} at {r.target}{where}",
             f"{r.parameter} [{r.unit}]" if r.unit not in ("", "1") else r.parameter,
             s.recording,
             s.estimate,
             s.low,
             s.high,
+            100 * s.error_without,
+            100 * s.error_with,
+            _words(s.ahead) or "none",
         )
-        for r in repeated
+        for r, where in found
         for s in r.recordings
     ]
-    lines = []
-    for r in repeated:
-        name = f"{r.parameter} of {r.effect.replace('_', ' ')} at {r.target}"
+    needs = {(r.effect, r.target, where): r for r, where in found}
+    lines = [_need(r, where) for (_, _, where), r in needs.items()]
+    for r, where in found:
+        name = f"{r.parameter} of {r.effect.replace('_', ' ')} at {r.target}{where}"
         if r.agree:
             lines.append(f"- {name}: the recordings agree within their intervals.")
         else:
@@ -184,9 +191,31 @@ def repeatability_section(repeated: Sequence[Repeated]) -> list[Section]:
                 "stand in for another one."
             )
     columns = ["effect", "parameter", "recording", "estimate", "low", "high"]
-    caption = "Each recording fitted alone, with its 95 % interval; – where it does not show it."
+    columns += ["error without [%]", "error with [%]", "rivals ahead"]
+    caption = (
+        "Each recording fitted alone, with its 95 % interval; – where it does not show it. Errors "
+        "are of that recording's spread; rivals ahead promise to explain clearly more of it."
+    )
     text = "\n".join(lines)
     return [Section("The same in every recording?", text, tables=[Table(columns, rows, caption)])]
+
+
+def _need(repeated: Repeated, where: str) -> str:
+    """Say in which recordings the effect is what each by itself would have asked for first."""
+    seen = repeated.recordings
+    name = f"{repeated.effect.replace('_', ' ')} at {repeated.target}{where}"
+    others = [s for s in seen if not s.is_needed]
+    if not others:
+        return f"- {name}: every recording by itself asks for this effect first."
+    doubts = "; ".join(
+        f"{s.recording} for {_words(s.ahead)}" if s.ahead else f"{s.recording} does not need it"
+        for s in others
+    )
+    return f"- {name}: {len(seen) - len(others)} of {len(seen)} recordings ask for it; {doubts}."
+
+
+def _words(named: Sequence[Named]) -> str:
+    return ", ".join(str(n).replace("_", " ") for n in named)
 
 
 def drift_section(drifts: Sequence[Drift]) -> list[Section]:

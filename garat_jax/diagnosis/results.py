@@ -136,12 +136,30 @@ class Experiment:
 
 @dataclasses.dataclass(frozen=True)
 class Sighting:
-    """A parameter with its 95 % interval as one recording alone shows it; NaN where it does not."""
+    """What one recording alone shows of a parameter, and of the effect that it belongs to.
+
+    Attributes:
+        recording: Its name.
+        estimate: The parameter; NaN where the recording does not show it.
+        low: The lower end of its 95 % interval.
+        high: The upper end.
+        error_without: Error in this recording, of its signals' spread, without the effect.
+        error_with: The same with it.
+        ahead: Rivals of the effect that are expected to explain more of this recording.
+    """
 
     recording: str
     estimate: float
     low: float
     high: float
+    error_without: float
+    error_with: float
+    ahead: tuple[Named, ...]
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether the effect is what this recording by itself would have asked for first."""
+        return self.error_with < self.error_without and not self.ahead
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,6 +251,11 @@ class Diagnosis:
         sizes = {c.named: c.sizes for c in self.selected}
         return f"+ {rung.added.named} ({sizes[rung.added.named]})"
 
+    def under(self, condition: str) -> tuple[Candidate, ...]:
+        """Return all effects under a condition: the shared ones, some replaced, and its own."""
+        own = {c.named: c for c in self.conditions[condition].selected}
+        return tuple(({c.named: c for c in self.selected} | own).values())
+
     def to_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json; what is not finite is null."""
         plain = to_plain(dataclasses.replace(self, conditions={}))
@@ -294,10 +317,15 @@ class Diagnosis:
             lines.append(f"  next: {self.next_experiment.how}")
         if self.verdict == "unexplained":
             lines.append(f"  or: {OFFER}")
-        shared = [c.named for c in self.selected]
+        return "\n".join([*lines, *self.other_conditions])
+
+    @property
+    def other_conditions(self) -> list[str]:
+        """What was found under other conditions, line by line."""
+        lines, shared = [], [c.named for c in self.selected]
         for name, found in self.conditions.items():
             lines.append(f"Under the condition {name}, with the above: {found.sentence}")
             for c in found.selected:
                 instead = " (instead of the shared one)" if c.named in shared else ""
                 lines.append(f"  {c.named}{instead}: {c.sizes}")
-        return "\n".join(lines)
+        return lines

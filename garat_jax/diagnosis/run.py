@@ -8,11 +8,13 @@ from typing import NamedTuple
 from rich.console import Console
 
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.conditions import diagnose_conditions
+from garat_jax.diagnosis.conditions import diagnose_conditions, read_conditions, write_cards
+from garat_jax.diagnosis.export import copy_model
 from garat_jax.diagnosis.model_card import load_model
 from garat_jax.diagnosis.progress import progress
 from garat_jax.diagnosis.repeat import repeatability
 from garat_jax.diagnosis.report import diagnosis_sections, write_diagnosis
+from garat_jax.diagnosis.report_conditions import condition_sections
 from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue
@@ -38,6 +40,9 @@ def run_diagnose(
 ) -> Diagnosed:
     """Diagnose a model file with recordings; write diagnosis.json and report.html into a run.
 
+    With conditions, model.toml and a model-CONDITION.toml for each hold what was found, with the
+    model's own files in `model/`.
+
     Args:
         model: MJCF or model card.
         data: Recordings to find the missing effects with.
@@ -48,20 +53,21 @@ def run_diagnose(
         conditions: Recordings made under other conditions than `data`, by the condition's name.
 
     Raises:
-        UserError: A file cannot be read or does not fit the model.
+        UserError: A file cannot be read, does not fit the model, or cannot be copied.
     """
     loaded = load_model(model, catalogue)
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
-    others = {
-        name: read_recordings(loaded, paths, columns) for name, paths in (conditions or {}).items()
-    }
+    others = read_conditions(loaded, conditions, columns)
+    copied = copy_model(loaded, run.path("model")) if others else loaded.mjcf
     with progress("looking at the recordings") as say:
         diagnosis = diagnose_conditions(loaded, recordings, others, held_out, say)
-        again = repeatability(loaded, recordings, held_out, diagnosis.selected, say)
-        diagnosis = dataclasses.replace(diagnosis, repeatability=again)
+        diagnosis = repeatability(loaded, diagnosis, recordings, held_out, others, say)
         run.write_json("diagnosis.json", diagnosis.to_json())
+        if others:
+            write_cards(run, dataclasses.replace(loaded, mjcf=copied), diagnosis)
         say("writing the report")
         sections = diagnosis_sections(diagnosis, loaded, recordings, held_out)
+        sections += condition_sections(diagnosis, loaded, others)
         write_diagnosis(run, diagnosis, loaded.name, sections)
     Console(highlight=False, markup=False, soft_wrap=True).print(str(diagnosis))
     return Diagnosed(diagnosis, sections)

@@ -2,16 +2,22 @@
 
 import dataclasses
 import functools
+import json
+import re
 from typing import cast
 
 import numpy as np
 import pytest
 
 from garat_jax.cli import main
+from garat_jax.diagnosis import load_model, run_diagnose
 from garat_jax.diagnosis.conditions import JointSimulator, diagnose_conditions
+from garat_jax.diagnosis.convert import write_csv
+from garat_jax.diagnosis.improve import run_improve
 from garat_jax.diagnosis.segments import Segments
 from garat_jax.diagnosis.simulate import Simulator, Slot
 from garat_jax.effects import CATALOGUE, TorqueOffset, ViscousDamping
+from garat_jax.runs import RunDirectory
 from tests import models
 from tests.diagnosis.pendulum import MODEL, add_damping, add_payload, record
 
@@ -110,10 +116,56 @@ def test_each_condition_is_simulated_with_what_is_shared_and_what_is_its_own():
     np.testing.assert_array_equal(of_each[0], np.arange(1, 5)[:, None, None] * predicted[0])
 
 
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    (folder / "pendulum.xml").write_text(models.PENDULUM)
+    for name, pull in (("base", 0.0), ("pulled", 0.1)):
+        for seed in range(3):
+            made = record(add_damping, seed, pull)
+            columns = {"time": made.time, "qpos.hinge": made.qpos[:, 0]}
+            columns |= {"qvel.hinge": made.qvel[:, 0], "ctrl.motor": made.ctrl[:, 0]}
+            write_csv(folder / f"{name}_{seed}.csv", columns)
+    return folder
+
+
+@pytest.mark.parametrize("command", ["diagnose", "improve"])
+def test_each_condition_has_a_card_traces_and_its_recordings_one_by_one(files, tmp_path, command):
+    run = RunDirectory.create(tmp_path / "run", {}, f"garat {command}", [])
+    base, pulled = (sorted(files.glob(f"{name}_*.csv")) for name in ("base", "pulled"))
+    given = (files / "pendulum.xml", base, (), run)
+    if command == "diagnose":
+        found = run_diagnose(*given, catalogue=FEW, conditions={"cable": pulled}).diagnosis
+        content = json.loads((run.root / "diagnosis.json").read_text())
+    else:
+        found = run_improve(*given, catalogue=FEW, conditions={"cable": pulled}).diagnosis
+        content = json.loads((run.root / "improve.json").read_text())
+    shared, cable = (load_model(run.root / f"model{n}.toml").effects for n in ("", "-cable"))
+    assert [e.kind for e in shared] == ["viscous_damping"]
+    assert [e.kind for e in cable] == ["viscous_damping", "torque_offset"]
+    assert float(cable[1].torque) == pytest.approx(0.1, rel=0.05)
+
+    (damping,) = found.repeatability  # in all recordings, the pull in the condition's
+    assert [s.recording for s in damping.recordings] == [p.name for p in (*base, *pulled)]
+    assert all(s.is_needed for s in damping.recordings)
+    (pull,) = found.conditions["cable"].repeatability
+    assert [s.recording for s in pull.recordings] == [p.name for p in pulled]
+    assert content["conditions"]["cable"]["repeatability"][0]["effect"] == "torque_offset"
+
+    page = re.sub(r"<[^>]*>", " ", (run.root / "report.html").read_text())
+    assert "Measured against simulated under the condition cable" in page
+    assert "torque offset at joint/hinge (cable): every recording by itself asks" in page
+
+
 def test_a_condition_without_a_file_is_refused(tmp_path, capsys):
     model, data = tmp_path / "p.xml", tmp_path / "d.csv"
     model.write_text(models.PENDULUM)
     data.write_text("")
-    for word, said in (("loaded", "NAME=FILE"), ("loaded=none.csv", "there is no file none.csv")):
-        assert main(["diagnose", str(model), str(data), "--condition", word]) == 2
-        assert said in capsys.readouterr().err
+    for word, said in (
+        ("loaded", "NAME=FILE"),
+        ("loaded=none.csv", "there is no file none.csv"),
+        (f"a/b={data}", "may hold no folder"),
+    ):
+        for command in ("diagnose", "improve"):
+            assert main([command, str(model), str(data), "--condition", word]) == 2
+            assert said in capsys.readouterr().err

@@ -65,6 +65,8 @@ def test_each_recording_alone_shows_the_same_size(improved):
     for seen in repeated.recordings:
         assert seen.low < seen.estimate < seen.high
         assert seen.estimate == pytest.approx(made.parameters["torque"], rel=0.15)
+        assert seen.is_needed
+        assert seen.error_with < 0.3 * seen.error_without
 
 
 def test_the_report_says_what_was_done(improved):
@@ -75,6 +77,14 @@ def test_the_report_says_what_was_done(improved):
     for row in (r"1\s+missing effect\s+coulomb_friction at joint/hinge", r"2\s+adequate\s+nothing"):
         assert re.search(row, shown)
     assert "A last diagnosis of the repaired model found it adequate." in page
+    friction = "coulomb friction at joint/hinge"
+    assert f"{friction}: every recording by itself asks for this effect first." in page
+
+
+def test_an_improvement_shows_in_a_notebook(improved):
+    done = improved[2]
+    assert done._repr_html_().startswith("<pre>Missing: coulomb_friction at joint/hinge")
+    assert len(done.plot().data) and len(done.plot("ranking").data)
 
 
 def test_recordings_of_different_sizes_disagree(tmp_path, improved):
@@ -91,7 +101,7 @@ def test_recordings_of_different_sizes_disagree(tmp_path, improved):
         )  # fmt: skip
         files.append((made.fit[0], made.parameters["torque"]))
     recordings = [Recording.read(path, model) for path, _ in files]
-    (repeated,) = repeatability(model, recordings, (), done.diagnosis.selected)
+    (repeated,) = repeatability(model, done.diagnosis, recordings).repeatability
     assert not repeated.agree
     for seen, (_, size) in zip(repeated.recordings, files, strict=True):
         assert seen.estimate == pytest.approx(size, rel=0.15)
