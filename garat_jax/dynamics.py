@@ -19,6 +19,7 @@ from garat_jax._mjx import mjx
 from garat_jax.effects.base import Effect, ModelView
 from garat_jax.engine import HostModel
 from garat_jax.errors import UserError, unknown_name
+from garat_jax.mjx_model import put_model
 from garat_jax.overrides import Override
 from garat_jax.setconst import CONSTANT_INPUTS, set_const
 
@@ -85,7 +86,8 @@ def compile(
         engine: `mjx`, `mujoco`, or `auto`: C MuJoCo on a CPU and MJX elsewhere.
 
     Raises:
-        UserError: An override or effect does not fit the model, or the engine cannot step it.
+        UserError: An override or effect does not fit the model, or the engine cannot step it or
+            would ignore a part of it.
     """
     if engine not in ENGINES:
         raise unknown_name("engine", engine, ENGINES)
@@ -102,16 +104,9 @@ def compile(
         host = HostModel(spec.compile())
     except ValueError as error:
         raise UserError(f"MuJoCo cannot compile the model: {error}") from error
-    model = _put_model(host.model) if engine == "mjx" else None
+    model = put_model(host.model) if engine == "mjx" else None
     as_arrays = jax.tree.map(jnp.asarray, tuple(effects))
     return Dynamics(effects=as_arrays, model=model, host=host, engine=engine)
-
-
-def _put_model(model: mujoco.MjModel) -> mjx.Model:
-    try:
-        return mjx.put_model(model)
-    except NotImplementedError as error:
-        raise UserError(f"engine mjx cannot step this model: {error}; use mujoco") from error
 
 
 def view(dynamics: Dynamics) -> ModelView:

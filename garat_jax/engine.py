@@ -105,7 +105,10 @@ class HostModel:
     def _call(self, name: str, function, shape: tuple[int, ...], fields, state, commands, forces):
         """Call back with a batch of simulations, everything as 32-bit words."""
         if self.model.nhistory or self.model.nplugin:
-            raise UserError("engine mujoco does not carry plugins or native delays; use mjx")
+            raise UserError(
+                "engine mujoco does not carry plugins or native delays, and MJX ignores them; take "
+                "them out of the model (for a delay give the effect actuator_delay or sensor_delay)"
+            )
         row = jnp.concatenate(
             [state.time[None], state.qpos, state.qvel, state.act, state.qacc_warmstart]
         )

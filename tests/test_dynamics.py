@@ -387,9 +387,3 @@ def test_kinds_at_one_target_are_pytrees_of_their_own():
     ]
     for i, structure in enumerate(structures):
         assert all(structure != other for other in structures[:i])
-
-
-def test_a_model_that_mjx_cannot_step_is_refused_in_one_line():
-    implicit = "<mujoco><option integrator='implicit'/><worldbody/></mujoco>"
-    with pytest.raises(UserError, match=r"engine mjx cannot step this model: .*; use mujoco"):
-        dynamics.compile(spec(implicit), engine="mjx")

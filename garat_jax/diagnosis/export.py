@@ -16,7 +16,7 @@ class Exported(NamedTuple):
 
     Attributes:
         path: The file.
-        unsaid: What MJCF cannot say, one line each.
+        unsaid: What MJCF cannot say, or MJX does not step, one line each.
     """
 
     path: Path

@@ -295,7 +295,7 @@ class Effect(abc.ABC):
             spec: The model, without this effect's `prepare`.
 
         Returns:
-            What MJCF cannot say of it, in one line; empty if it says everything.
+            What MJCF cannot say of it, or MJX does not step, in one line; else empty.
         """
         del spec
         return f"MJCF has no words for {self.kind} at {self.target}"

@@ -390,4 +390,4 @@ class QuadraticDrag(Effect):
     def export(self, spec: mujoco.MjSpec) -> str:
         """Write it as the second coefficient of the joint's polynomial damping."""
         spec.joint(self.name).damping[1] += float(self.coefficient)
-        return ""
+        return "said by polynomial damping, which C MuJoCo steps and MJX does not"

@@ -5,7 +5,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from garat_jax.dynamics import compile
 from garat_jax.effects import CATALOGUE
+from garat_jax.errors import UserError
 from tests.effects.truth import RIG, SUBSTEPS, commands, predict
 from tests.models import spec
 
@@ -66,7 +68,7 @@ def test_the_exported_model_moves_as_ours(kind):
     ctrl = np.concatenate([np.zeros(10), commands()])
     path, left_out = exported(effect, ctrl)
     ours, plain = predict(RIG, (effect,), ctrl), predict(RIG, (), ctrl)
-    assert bool(left_out) == (kind in ("actuator_delay", "actuator_lag"))
+    assert bool(left_out) == (kind not in WHOLE)
     assert np.abs(plain - ours).max() > 0.05
     if kind in NEARLY:  # another discretisation of the same law
         assert np.abs(path - ours).max() < 0.1 * np.abs(plain - ours).max()
@@ -80,6 +82,14 @@ def test_what_mjcf_cannot_say_is_said(kind):
     left_out = exported(make(kind, values), commands()[:2])[1]
     assert words in left_out
     assert "\n" not in left_out
+
+
+@pytest.mark.parametrize("kind", ["quadratic_drag", "actuator_delay"])
+def test_what_mjx_would_ignore_of_an_exported_model_is_said_and_refused(kind):
+    changed = spec(RIG)
+    assert "MJX does not" in make(kind, {**NEARLY, **FROM_REST}[kind]).export(changed)
+    with pytest.raises(UserError, match="engine mjx cannot step this model: it ignores"):
+        compile(changed, engine="mjx")
 
 
 def test_an_offset_without_an_unlimited_actuator_is_said():

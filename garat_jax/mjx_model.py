@@ -1,0 +1,52 @@
+"""A compiled model as MJX steps it, or one line that says what of it MJX cannot step."""
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+
+from garat_jax._mjx import mjx
+from garat_jax.errors import UserError
+
+HINT = "use engine mujoco, which JAX_PLATFORMS=cpu chooses"
+DELAY_HINT = "take it out of the model, and give the effect actuator_delay or sensor_delay"
+
+
+def put_model(model: mujoco.MjModel) -> mjx.Model:
+    """Return a model for MJX.
+
+    Raises:
+        UserError: MJX cannot step the model, or would ignore a part of it.
+    """
+    for feature, element, has, hint in _ignored(model):
+        names = [f"{element}/{_name(model, element, int(i))}" for i in np.flatnonzero(has)]
+        if names:
+            at = ", ".join(names)
+            raise UserError(
+                f"engine mjx cannot step this model: it ignores {feature} ({at}); {hint}"
+            )
+    if model.nplugin:
+        raise UserError("engine mjx cannot step this model: it ignores plugins; take them out")
+    try:
+        return mjx.put_model(model)
+    except NotImplementedError as error:
+        raise UserError(f"engine mjx cannot step this model: {error}; use mujoco") from error
+
+
+def _ignored(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray, str]]:
+    """Yield what MJX 3.17 leaves out without a word: feature, element, which have it, a hint."""
+    bent = np.unique(model.dof_jntid[model.dof_dampingpoly.any(axis=1)])
+    yield "polynomial damping", "joint", np.isin(np.arange(model.njnt), bent), HINT
+    yield "polynomial stiffness", "joint", model.jnt_stiffnesspoly.any(axis=1), HINT
+    yield "polynomial damping", "tendon", model.tendon_dampingpoly.any(axis=1), HINT
+    yield "polynomial stiffness", "tendon", model.tendon_stiffnesspoly.any(axis=1), HINT
+    damped = (model.actuator_damping != 0) | model.actuator_dampingpoly.any(axis=1)
+    yield "an actuator's damping", "actuator", damped, HINT
+    yield "an actuator's armature", "actuator", model.actuator_armature != 0, HINT
+    yield "a native delay", "actuator", model.actuator_delay > 0, DELAY_HINT
+    yield "a native delay or interval", "sensor", model.sensor_history[:, 0] > 0, DELAY_HINT
+
+
+def _name(model: mujoco.MjModel, element: str, index: int) -> str:
+    kind = mujoco.mju_str2Type(element)
+    return mujoco.mj_id2name(model, kind, index) or str(index)
