@@ -8,11 +8,12 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import SMALLEST_SHARE
 from garat_jax.diagnosis.localise import localise, missing_torque
-from garat_jax.diagnosis.measurements import Recording, signals
+from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem

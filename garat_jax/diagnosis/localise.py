@@ -6,14 +6,16 @@ actuators give, both smoothed by the same filter. It is a second view, independe
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
 from scipy import signal
 
-from garat_jax.diagnosis.measurements import Recording
 from garat_jax.effects.base import DOFS_OF_JOINT, element_names
+
+if TYPE_CHECKING:
+    from garat_jax.diagnosis.measurements import Recording
 
 WINDOW = 0.06
 """Seconds of the smoothing filter: short against a robot joint's motion."""
@@ -70,7 +72,7 @@ class MissingTorque(NamedTuple):
     drive: np.ndarray
 
 
-def missing_torque(model: mujoco.MjModel, recordings: Sequence[Recording]) -> MissingTorque:
+def missing_torque(model: mujoco.MjModel, recordings: "Sequence[Recording]") -> MissingTorque:
     """Compute the torque that a model lacks along the recordings.
 
     Args:
@@ -142,7 +144,7 @@ def _features(m: MissingTorque, dof: int):
     yield "drifting with time, with the command", drift * m.command[:, dof], words
 
 
-def _of_span(model: mujoco.MjModel, recording: Recording, span: slice):
+def _of_span(model: mujoco.MjModel, recording: "Recording", span: slice):
     """Return the columns of `MissingTorque` for one span of one recording."""
     time = recording.time[span]
     interval = float(np.median(np.diff(time)))

@@ -11,9 +11,10 @@ import mujoco
 import numpy as np
 from scipy import signal as filters
 
+from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.filters import quantum
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
-from garat_jax.diagnosis.measurements import Recording, noise, signals
+from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.effects.base import element_names
 
 LAGS = np.arange(-0.02, 0.1001, 0.0005)

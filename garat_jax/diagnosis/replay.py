@@ -7,12 +7,14 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from garat_jax.diagnosis.measurements import Recording, estimate_velocity, signals
+from garat_jax.diagnosis.columns import signals
+from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.segments import QUIET, Grid, Segments, choose_grid, cut, metric_spread
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.velocity import estimate_velocity
 
 
 class Size(NamedTuple):

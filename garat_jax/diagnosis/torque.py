@@ -10,8 +10,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from garat_jax.diagnosis.columns import torques
 from garat_jax.diagnosis.localise import missing_torque
-from garat_jax.diagnosis.measurements import Recording, torques
+from garat_jax.diagnosis.measurements import Recording
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +20,7 @@ class TorqueError:
     """How a joint's measured torque and the model's differ.
 
     Attributes:
-        joint: The joint.
+        joint: The joint; of a ball or free joint the dof too, as `NAME.0`.
         unit: N m or N.
         measured_rms: Root mean square of the measured torque.
         actuator_rmse: Against what the model's actuators give for the recorded commands.
@@ -56,9 +57,8 @@ def compare_torques(
         recordings: What was measured.
     """
     found = []
-    for signal in torques(model):
+    for dof, signal in enumerate(torques(model)):
         joint = signal.name.partition(".")[2]
-        dof = int(model.jnt_dofadr[model.joint(joint).id])
         rows = [
             _of_recording(model, recording, joint, dof)
             for recording in recordings

@@ -7,7 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from garat_jax.diagnosis.measurements import Recording, estimate_velocity, noise, signals
+from garat_jax.diagnosis.columns import signals, torques
+from garat_jax.diagnosis.measurements import Recording, noise
+from garat_jax.diagnosis.velocity import estimate_velocity
 from garat_jax.errors import UserError
 from tests import models
 
@@ -79,6 +81,19 @@ def test_a_model_without_actuators_needs_no_commands(tmp_path):
 def test_measured_torque_is_kept(tmp_path):
     path = save(tmp_path, columns(torque__hinge=np.full(200, 0.5)))
     np.testing.assert_array_equal(Recording.read(path, MODEL).torque["hinge"], 0.5)
+
+
+def test_torques_of_ball_and_free_joints_are_numbered(tmp_path):
+    time, qpos, _ = tumbling()
+    names = [s.name for s in signals(TUMBLER)][: TUMBLER.nq]
+    table = {"time": time, **dict(zip(names, qpos.T, strict=True))}
+    assert [s.unit for s in torques(TUMBLER)] == ["N"] * 3 + ["N m"] * 6
+    numbered = {s.name: np.full(len(time), float(i)) for i, s in enumerate(torques(TUMBLER))}
+    recording = Recording.read(save(tmp_path, table | numbered), TUMBLER)
+    assert list(recording.torque)[4:] == ["free.4", "free.5", "ball.0", "ball.1", "ball.2"]
+    assert recording.torque["ball.2"][0] == 8.0
+    message = refusal(save(tmp_path, table | {"torque.ball": np.zeros(len(time))}), TUMBLER)
+    assert "unknown column 'torque.ball'; did you mean torque.ball." in message
 
 
 def test_unknown_column_names_the_nearest(tmp_path):

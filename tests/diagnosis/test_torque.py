@@ -54,3 +54,23 @@ def test_hidden_friction_shows_in_the_torque_of_the_motion():
 def test_without_measured_torques_there_is_nothing_to_compare():
     model = models.spec(SERVO).compile()
     assert compare_torques(model, [dataclasses.replace(track(0.0), torque={})]) == ()
+
+
+def test_each_dof_of_a_ball_joint_is_compared():
+    model = models.spec(models.TUMBLER).compile()
+    data = mujoco.MjData(model)
+    data.qpos[2] = 20.0
+    data.qvel[:] = [0.3, -0.2, 1.0, 1.5, -2.0, 1.0, 0.7, 1.1, -0.4]
+    rows = []
+    for k in range(500):
+        data.qfrc_applied[7] = 1e-3 * np.sin(0.05 * k)
+        mujoco.mj_step1(model, data)
+        rows.append((data.time, data.qpos.copy(), data.qvel.copy(), data.qfrc_applied[7]))
+        mujoco.mj_step2(model, data)
+    time, qpos, qvel, torque = (np.asarray(column) for column in zip(*rows, strict=True))
+    measured = {"ball.1": torque, "free.0": np.zeros(len(time))}
+    nothing, spans = np.zeros((len(time), 0)), ((0, len(time)),)
+    recording = Recording("made.csv", time, qpos, qvel, nothing, measured, True, spans, ())
+    errors = compare_torques(model, [recording])
+    assert [(e.joint, e.unit) for e in errors] == [("free.0", "N"), ("ball.1", "N m")]
+    assert errors[1].motion_fit_percent > 80
