@@ -11,7 +11,7 @@ from scipy import io
 from garat_jax.diagnosis.bags import Series, is_bag, read_bag
 from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.maps import ColumnMap, read_map
-from garat_jax.diagnosis.tables import numbers_of, read_table
+from garat_jax.diagnosis.tables import DAMAGED, Table, check_samples, numbers_of, read_table
 from garat_jax.errors import UserError, unknown_name
 
 TABLES = (".csv", ".parquet")
@@ -34,10 +34,13 @@ def convert_log(log: Path, map_file: Path, out: Path) -> str:
         What was written, in one line.
 
     Raises:
-        UserError: The log or the map cannot be read, or they do not fit each other.
+        UserError: The log or the map cannot be read, they do not fit each other, or what the log
+            holds is no recording.
     """
     column_map = read_map(map_file)
     suffix = log.suffix.lower()
+    if log.is_file() and log.stat().st_size == 0:
+        raise UserError(f"{log}: the file is empty; expected {KINDS}")
     if is_bag(log):
         columns = _from_bag(log, column_map)
     elif suffix in TABLES:
@@ -48,6 +51,7 @@ def convert_log(log: Path, map_file: Path, out: Path) -> str:
         raise UserError(f"{log}: unknown kind of log; expected {KINDS}")
     if "time" not in columns:
         raise UserError(f'{map_file}: the samples have no time; add time = "NAME"')
+    check_samples(Table(log, columns))
     columns = {"time": columns["time"] - columns["time"][0], **_without_time(columns)}
     write_csv(out, columns)
     seconds, num = float(columns["time"][-1]), len(columns["time"])
@@ -105,7 +109,7 @@ def _from_arrays(log: Path, column_map: ColumnMap) -> dict[str, np.ndarray]:
 
 
 def _one_column(log: Path, array: np.ndarray, source: str, column: str | None) -> np.ndarray:
-    array = np.squeeze(array)
+    array = np.atleast_1d(np.squeeze(array))
     if array.ndim == 2 and column is not None:
         array = array if array.shape[0] >= array.shape[1] else array.T  # samples come first
         if int(column) >= array.shape[1]:
@@ -122,11 +126,11 @@ def _one_column(log: Path, array: np.ndarray, source: str, column: str | None) -
 
 def _npz(log: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(log, allow_pickle=False) as archive:
+        with log.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: numbers_of(log, archive, name) for name in archive.files}
-    except (OSError, ValueError) as error:
-        if isinstance(error, UserError):
-            raise
+    except UserError:
+        raise
+    except DAMAGED as error:
         raise UserError(f"{log}: not an NPZ archive; write it with numpy.savez") from error
 
 

@@ -18,13 +18,11 @@ from garat_jax.diagnosis.filters import white_noise
 from garat_jax.diagnosis.maps import ColumnMap
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.oddities import oddities
-from garat_jax.diagnosis.tables import Table, read_table
+from garat_jax.diagnosis.tables import FEWEST_SAMPLES, Table, check_samples, read_table
 from garat_jax.diagnosis.velocity import estimate_velocity, quaternions
 from garat_jax.dynamics import native_model
 from garat_jax.errors import UserError, nearest, unknown_name
 
-FEWEST_SAMPLES = 20
-"""Samples that a recording must have, and each part of it between gaps."""
 GAP = 5.0
 """A step longer than this many median steps is a gap."""
 
@@ -77,7 +75,7 @@ class Recording:
             model = native_model(model.compile(engine="mujoco"))
         table = _read(path, model, column_map)
         velocity_measured = _check_columns(table, model)
-        _check_values(table)
+        check_samples(table)
         columns = table.columns
         time = columns["time"]
         spans, warnings = _split(table.path, time)
@@ -161,28 +159,6 @@ def _missing(table: Table, name: str) -> UserError:
     close = nearest(name, table.columns)
     there = f"nearest is {close[0]}" if close else f"there are {', '.join(table.columns)}"
     return UserError(f"{table.path}: missing column {name!r} ({reason}); {there}")
-
-
-def _check_values(table: Table) -> None:
-    time = table.columns["time"]
-    if len(time) < FEWEST_SAMPLES:
-        raise UserError(
-            f"{table.path}: {len(time)} samples; expected at least {FEWEST_SAMPLES}, "
-            "and some seconds of motion"
-        )
-    for name, column in table.columns.items():
-        bad = ~np.isfinite(column)
-        if bad.any():
-            raise UserError(
-                f"{table.path}: {name} is NaN, infinite or empty at {table.rows(bad)}; "
-                "expected a finite number: leave such samples out, a gap is split there"
-            )
-    late = np.concatenate([[False], np.diff(time) <= 0])
-    if late.any():
-        raise UserError(
-            f"{table.path}: time does not increase at {table.rows(late)}; "
-            "sort the samples, leave double ones out, and give each recording its own file"
-        )
 
 
 def _split(path: Path, time: np.ndarray) -> tuple[tuple[tuple[int, int], ...], list[str]]:

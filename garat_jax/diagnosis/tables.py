@@ -2,6 +2,7 @@
 
 import csv
 import zipfile
+import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -10,6 +11,10 @@ import pandas as pd
 
 from garat_jax.errors import UserError, unknown_name
 
+FEWEST_SAMPLES = 20
+"""Samples that a recording must have, and each part of it between gaps."""
+DAMAGED = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What the readers raise on files that are damaged."""
 ROWS_NAMED = 5
 """How many bad rows a message names."""
 SEPARATORS = (",", ";", "\t")
@@ -76,9 +81,36 @@ def read_table(path: str | Path, wanted: Collection[str] | None = None) -> Table
         return Table(path, reader(path, wanted))
     except UserError:
         raise
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except DAMAGED as error:
         detail = " ".join(str(error).split()) or type(error).__name__
         raise UserError(f"{path}: cannot be read as {path.suffix[1:].upper()}: {detail}") from error
+
+
+def check_samples(table: Table) -> None:
+    """Refuse a recording without enough samples, or with values that cannot be right.
+
+    Raises:
+        UserError: There are too few samples, one is not finite, or time does not increase.
+    """
+    time = table.columns["time"]
+    if len(time) < FEWEST_SAMPLES:
+        raise UserError(
+            f"{table.path}: {len(time)} samples; expected at least {FEWEST_SAMPLES}, "
+            "and some seconds of motion"
+        )
+    for name, column in table.columns.items():
+        bad = ~np.isfinite(column)
+        if bad.any():
+            raise UserError(
+                f"{table.path}: {name} is NaN, infinite or empty at {table.rows(bad)}; "
+                "expected a finite number: leave such samples out, a gap is split there"
+            )
+    late = np.concatenate([[False], np.diff(time) <= 0])
+    if late.any():
+        raise UserError(
+            f"{table.path}: time does not increase at {table.rows(late)}; "
+            "sort the samples, leave double ones out, and give each recording its own file"
+        )
 
 
 def _read_csv(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
@@ -92,8 +124,9 @@ def _read_csv(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarra
         mark = "';'" if ";" in header[0] else "tabs"
         raise UserError(f"{path}: columns are separated by {mark}; expected commas")
     if all(_is_number(name) for name in header):
+        holds = "holds numbers" if header else "is empty"
         raise UserError(
-            f"{path}: line 1 holds numbers; expected the columns' names, such as time,qpos.JOINT"
+            f"{path}: line 1 {holds}; expected the columns' names, such as time,qpos.JOINT"
         )
     twice = [name for name in header if header.count(name) > 1]
     if twice:
@@ -141,7 +174,7 @@ def _read_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarra
     if not zipfile.is_zipfile(path):
         raise UserError(f"{path}: not an NPZ archive; write it with numpy.savez")
     columns = {}
-    with np.load(path, allow_pickle=False) as archive:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         check_wanted(path, wanted or (), archive.files)
         for name in archive.files if wanted is None else dict.fromkeys(wanted):
             columns[name] = numbers_of(path, archive, name)

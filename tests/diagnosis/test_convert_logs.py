@@ -204,8 +204,70 @@ def test_damaged_logs_are_refused(tmp_path, capsys, name):
 
 
 def test_other_logs_are_refused(tmp_path, capsys):
-    (tmp_path / "log.txt").touch()
+    (tmp_path / "log.txt").write_text("1 2 3")
     assert convert(tmp_path, tmp_path / "log.txt", OF_ARRAYS)[0] == 2
     assert "unknown kind of log; expected a bag" in capsys.readouterr().err
     assert cli.main(["convert", "no.mcap", "--map", "m", "--out", "x.csv"]) == 2
     assert "LOG: there is no file no.mcap" in capsys.readouterr().err
+
+
+WRITERS = {
+    "log.csv": lambda path, table: pd.DataFrame(table).to_csv(path, index=False),
+    "log.parquet": lambda path, table: pd.DataFrame(table).to_parquet(path),
+    "log.npz": lambda path, table: np.savez(path, **table),
+    "log.mat": lambda path, table: io.savemat(path, table),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda table: {n: c[:0] for n, c in table.items()}, "0 samples; expected at least 20"),
+        (lambda table: {n: c[:1] for n, c in table.items()}, "1 samples; expected at least 20"),
+        (lambda table: table | {"a": np.full(NUM, np.nan)}, "qpos.hinge is NaN, infinite or empty"),
+        (lambda table: table | {"t": np.full(NUM, np.nan)}, "time is NaN, infinite or empty"),
+        (lambda table: table | {"t": table["t"][::-1]}, "time does not increase"),
+    ],
+)
+def test_logs_that_hold_no_recording_are_refused(tmp_path, capsys, name, change, said):
+    made = {"t": STAMPS, "a": ANGLE, "s": SPEED, "u": STAMPS}
+    WRITERS[name](tmp_path / name, change(made))
+    columns = COLUMNS.format(angle="a", speed="s", torque="u")
+    (tmp_path / "data.csv").write_text("kept")
+    log, path = str(tmp_path / name), tmp_path / "map.toml"
+    path.write_text(f'format = "garat-map/1"\n[column]\ntime = "t"\n{columns}')
+    out = str(tmp_path / "data.csv")
+    assert cli.main(["convert", log, "--map", str(path), "--out", out, "--force"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert name in line
+    assert (tmp_path / "data.csv").read_text() == "kept"
+
+
+def test_a_bag_of_one_message_is_refused(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "NUM", 1)
+    assert convert(tmp_path, write_bag(tmp_path, "mcap"), OF_BAGS, time="")[0] == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "samples; expected at least 20" in line
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "mat", "mcap", "bag", "db3"])
+def test_empty_files_are_refused(tmp_path, capsys, suffix):
+    log = tmp_path / f"log.{suffix}"
+    log.touch()
+    assert convert(tmp_path, log, OF_BAGS, time="")[0] == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{log}: the file is empty; expected a bag" in line
+
+
+def test_an_archive_cut_short_is_refused(tmp_path, capsys):
+    whole, log = tmp_path / "whole.npz", tmp_path / "log.npz"
+    np.savez_compressed(whole, **arrays())
+    content = bytearray(whole.read_bytes())
+    content[80:120] = bytes(40)
+    for damaged in (content, whole.read_bytes()[:300]):
+        log.write_bytes(damaged)
+        assert convert(tmp_path, log, OF_ARRAYS)[0] == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "log.npz" in line

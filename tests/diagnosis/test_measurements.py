@@ -245,6 +245,7 @@ def test_npz_arrays_must_be_equally_long_columns(tmp_path):
         ("run.txt", b"time\n0\n", "unknown kind of file '.txt'; expected .csv, .parquet, .npz"),
         ("run.csv", b"time;qpos.hinge\n0;1\n", "separated by ';'; expected commas"),
         ("run.csv", b"0.0,1.0\n0.1,1.1\n", "line 1 holds numbers; expected the columns' names"),
+        ("run.csv", b"\n\n", "line 1 is empty; expected the columns' names"),
         ("run.csv", b"time,time\n0.1,1.1\n", "column 'time' is there 2 times"),
         ("run.csv", b"time,qpos.hinge\n0,1\n0,1,2,3\n", "cannot be read as CSV"),
         ("run.csv", b"time,qpos.hinge,ctrl.motor\n", "0 samples; expected at least 20"),
