@@ -77,7 +77,7 @@ class Transfer:
     seeds: int = 5
     """How many seeds: 0, 1, ..."""
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
-    """Physics: MJX, C MuJoCo, or the faster of the two on this machine."""
+    """Physics: MJX, C MuJoCo (mujoco), or C MuJoCo on a CPU and MJX elsewhere (auto)."""
     device: Device = "auto"
     """What computes."""
     distributed: bool = False
@@ -109,8 +109,11 @@ class Transfer:
 
         process = 0
         if self.distributed:
-            process = join_processes(self.coordinator, self.num_processes, self.process_id)
-        use(self.device)
+            process = join_processes(
+                self.coordinator, self.num_processes, self.process_id, self.device
+            )
+        else:
+            use(self.device)
         config = choose("method", self.method, METHODS)(
             choose("pair", self.pair, PAIRS), seeds=self.seeds, engine=self.engine
         )

@@ -23,32 +23,50 @@ def use(device: str) -> list[Any]:
         The devices.
 
     Raises:
-        UserError: There is none of that kind.
+        UserError: There is none of that kind, or JAX computes on another kind already.
     """
+    _prefer(device)
+    try:
+        devices = jax.devices()
+    except RuntimeError as error:
+        raise describe(error) from error
+    if device not in ("auto", platform := devices[0].platform):
+        raise UserError(
+            f"JAX computes on {platform!r} already, so {device!r} comes too late; "
+            "choose the device before anything asks JAX to compute"
+        )
+    return devices
+
+
+def _prefer(device: str) -> None:
+    """Tell JAX, which starts its devices when it is first asked for them, which to start."""
     if device != "auto":
         # The CPU stays there for what accelerators ask of the host.
         jax.config.update("jax_platforms", device if device == "cpu" else f"{device},cpu")
-    try:
-        return jax.devices()
-    except RuntimeError as error:
-        raise describe(error) from error
 
 
-def join_processes(coordinator: str | None, num_processes: int | None, process: int | None) -> int:
+def join_processes(
+    coordinator: str | None,
+    num_processes: int | None,
+    process: int | None,
+    device: str = "auto",
+) -> int:
     """Work with other processes, on the devices of all; before anything asks JAX to compute.
 
     Args:
         coordinator: Address and port of process 0.
         num_processes: How many there are.
         process: Which of them this is, from 0.
+        device: What computes; as for `use`.
 
     Returns:
         Which of them this is. What is None comes from JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES
         and JAX_PROCESS_ID, or from Slurm or MPI.
 
     Raises:
-        UserError: The processes do not come together.
+        UserError: The processes do not come together, or as `use`.
     """
+    _prefer(device)
     try:
         jax.distributed.initialize(
             coordinator,
@@ -60,6 +78,7 @@ def join_processes(coordinator: str | None, num_processes: int | None, process: 
             f"the processes do not come together: {error}; give --coordinator HOST:PORT, "
             "--num-processes N and --process-id K"
         ) from error
+    use(device)
     return jax.process_index()
 
 

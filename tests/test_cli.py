@@ -8,6 +8,7 @@ from garat_jax import cli
 from garat_jax.commandline import parse
 from garat_jax.errors import DivergedError, UserError, nearest, unknown_name
 from garat_jax.runs import RunDirectory, earlier_run_kept
+from tests.test_split import free_port
 
 
 def garat(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -176,3 +177,17 @@ def test_nearest_is_closest_first_and_ignores_case():
 
 def test_unknown_name_without_a_near_one_lists_all():
     assert "known: a, b" in str(unknown_name("effect", "friction", ["b", "a"]))
+
+
+@pytest.mark.parametrize("joining", [[], ["--distributed", "--num-processes", "1"]])
+def test_a_device_that_is_not_there_is_refused_alone_and_with_other_processes(joining, tmp_path):
+    arguments = ["transfer", "inverted_pendulum_heavy", "--device", "tpu", "--out", str(tmp_path)]
+    if joining:
+        joining = [*joining, "--process-id", "0", "--coordinator", f"localhost:{free_port()}"]
+    assert_refused(garat(*arguments, *joining), "no device 'tpu'", "--device")
+
+
+def test_a_device_that_comes_too_late_is_refused():
+    program = "import jax; jax.devices(); from garat_jax.devices import use; use('gpu')"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert "UserError: JAX computes on 'cpu' already, so 'gpu' comes too late" in done.stderr
