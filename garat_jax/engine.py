@@ -172,17 +172,18 @@ class HostModel:
     ) -> np.ndarray:
         """Step a batch under controls [num, .., nu + nv], each held for `repeat` substeps.
 
-        MuJoCo stops a simulation that diverges and repeats its last state; here it is NaN.
+        MuJoCo stops a simulation that diverges and repeats its last state; here that is NaN.
         """
         batch, num, length = simulations.batch, len(controls), controls.shape[1] * repeat
         chosen = np.repeat(controls if ids is None else controls[ids], repeat, axis=1)
-        time = simulations.state[:, 0]
-        end = time + (length - 0.5) * self.model.opt.timestep
+        begin = simulations.state[:, 0].copy()
         found = batch.rollout(length, chosen, INPUTS, record=("qpos", "qvel"), ids=ids)
         moved = np.concatenate([found["qpos"], found["qvel"]], axis=2)
         path = np.full((num, length // num_substeps, moved.shape[2]), np.nan)
         path[slice(None) if ids is None else ids] = moved[:, num_substeps - 1 :: num_substeps]
-        path[~(time > end)] = np.nan
+        done = (simulations.state[:, 0] - begin) / self.model.opt.timestep
+        steps = num_substeps * np.arange(1, path.shape[1] + 1)
+        path[~(done[:, None] > steps - 0.5)] = np.nan
         return path
 
     @contextlib.contextmanager

@@ -8,7 +8,7 @@ import numpy as np
 
 from garat_jax.diagnosis.diagnose import thin
 from garat_jax.diagnosis.fit import count_timestep, fit
-from garat_jax.diagnosis.horizon import choose_horizon
+from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
@@ -111,9 +111,13 @@ def size(
     if not free:
         raise UserError("every parameter is set, so nothing is left to fit; leave one of them out")
     horizon, segments = choose_horizon(simulator, recordings, grid)
+    say(say_horizon(recordings, horizon))
+    finer = Simulator(model, (effect,), grid, refine=2)
+    for warning in warn_of_divergence(simulator, finer, recordings, grid, horizon):
+        say(f"warning: {warning}")
     problem = Problem(
         simulator,
-        Simulator(model, (effect,), grid, refine=2),
+        finer,
         segments,
         np.ones(len(segments.start), bool),
         grid.interval * grid.per_sample,

@@ -14,11 +14,11 @@ import plotly.graph_objects as go
 from garat_jax import report
 from garat_jax.diagnosis import figures
 from garat_jax.diagnosis.diagnose import thin
-from garat_jax.diagnosis.horizon import choose_horizon
+from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.metric import ABOVE_FLOOR, Floor, make_metric, noise_floor
+from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import tell
@@ -26,7 +26,7 @@ from garat_jax.diagnosis.quality import Quality, assess
 from garat_jax.diagnosis.replay import Replay, Size, replay_with
 from garat_jax.diagnosis.residuals import Residuals, examine
 from garat_jax.diagnosis.results import Errors
-from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.segments import Grid, choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.torque import TorqueError, compare_torques
@@ -86,16 +86,19 @@ class Comparison:
     torques: tuple[TorqueError, ...]
     recordings: tuple[Quality, ...]
     also: tuple[Alternative, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def near_noise(self) -> bool:
         """Whether the error is what noise and the integrator's own error would make."""
-        return self.error.before <= ABOVE_FLOOR * self.error.noise_floor
+        return self.error.is_near_floor
 
     @property
     def sentence(self) -> str:
         """How large the error is, in one sentence."""
         error = self.error
+        if error.is_too_coarse:
+            return error.coarseness
         size = f"{100 * error.before:.2g} % of the signals' spread"
         if self.near_noise:
             return f"The model is near the sensors' noise: its error is {size}."
@@ -105,7 +108,8 @@ class Comparison:
         return " ".join([said, *worst])
 
     def __str__(self) -> str:
-        lines = [self.sentence, f"  residuals: {self.residuals.sentence(self.near_noise)}"]
+        lines = [self.sentence, *(f"  warning: {warning}" for warning in self.warnings)]
+        lines += [f"  residuals: {self.residuals.sentence(self.near_noise)}"]
         for name, row in self.error.per_signal.items():
             moves = np.isfinite(row["fit_percent"])
             fit = f"fit {row['fit_percent']:.1f} %" if moves else "hardly moves"
@@ -167,25 +171,28 @@ def compare(
     simulator = Simulator(model, (), grid)
     say("choosing the horizon")
     stated, _ = choose_horizon(simulator, recordings, grid)
+    say(say_horizon(recordings, stated))
+    finer = Simulator(model, (), grid, 2)
+    warnings = warn_of_divergence(simulator, finer, recordings, grid, stated)
     longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
     played = {}
     for horizon in sorted({stated, *(h for h in HORIZONS if h <= longest)}):
         say(f"predicting over {horizon:g} s")
         played[horizon] = replay_with(simulator, recordings, grid, horizon)
-    floor = _noise_floor(simulator, Simulator(model, (), grid, 2), played[stated], grid)
+    error = _errors(played[stated], simulator, finer, grid)
     alternatives = []
     for other in also:
         say(f"predicting with {other.path}")
         others = Simulator(other, (), grid)
         replays = {h: replay_with(others, recordings, grid, h) for h in played}
-        error = replays[stated].error()
-        alternatives.append(Alternative(str(other.path), error, _at_horizons(replays)))
+        of_other = replays[stated].error()
+        alternatives.append(Alternative(str(other.path), of_other, _at_horizons(replays)))
     return Comparison(
         model=str(model.path),
         data=tuple(r.name for r in recordings),
         versions=versions(),
         seconds=time.monotonic() - started,
-        error=_errors(played[stated], floor),
+        error=error,
         horizon=stated,
         horizons=_at_horizons(played),
         where=tuple(localise(missing_torque(host, recordings))),
@@ -193,6 +200,7 @@ def compare(
         torques=torques,
         recordings=qualities,
         also=tuple(alternatives),
+        warnings=warnings,
     )
 
 
@@ -258,28 +266,23 @@ def _at_horizons(played: Mapping[float, Replay]) -> tuple[AtHorizon, ...]:
     )
 
 
-def _noise_floor(simulator: Simulator, finer: Simulator, played: Replay, grid) -> Floor:
+def _errors(played: Replay, simulator: Simulator, finer: Simulator, grid: Grid) -> Errors:
     segments = played.segments
     nothing = np.zeros(len(segments.start), bool)
     problem = Problem(simulator, finer, segments, nothing, grid.interval * grid.per_sample)
-    settled = settle(problem, simulator.base, segments.start)
-    return noise_floor(problem, make_metric(problem), settled)
-
-
-def _errors(played: Replay, floor: Floor) -> Errors:
-    error, sizes = played.error(), played.sizes()
-    rest = np.sqrt(max(error**2 - floor.error**2, 0.0))
-    return Errors(
+    metric = make_metric(problem)
+    floor = noise_floor(problem, metric, settle(problem, simulator.base, segments.start))
+    return Errors.above(
+        floor.error,
+        metric.of_noise(~nothing),
         metric="root mean square of prediction error by signal's standard deviation, all "
         f"recordings, segments of {played.horizon:g} s",
-        unit="1",
-        before=error,
-        after=error,
-        noise_floor=floor.error,
-        unexplained_share=float(rest / error) if error > 0 else 0.0,
+        before=played.error(),
+        after=played.error(),
+        timestep=grid.timestep,
         per_signal={
             name: _signal(size, float(by_noise))
-            for (name, size), by_noise in zip(sizes.items(), floor.by_signal, strict=True)
+            for (name, size), by_noise in zip(played.sizes().items(), floor.by_signal, strict=True)
         },
     )
 

@@ -10,11 +10,16 @@ import numpy as np
 
 from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.drift import find_drifts
-from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
+from garat_jax.diagnosis.horizon import (
+    choose_horizon,
+    cut_longer,
+    say_horizon,
+    warn_of_divergence,
+)
 from garat_jax.diagnosis.judge import SMALLEST_SHARE
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, trusted
+from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rank import Outcome, explain
@@ -60,11 +65,13 @@ def diagnose(
     others = make_candidates(whole, native_model(model.compile(engine="mujoco")))
     grid = choose_grid(everything, host.opt.timestep)
     say("choosing the horizon")
-    _, segments = choose_horizon(Simulator(whole, (), grid), everything, grid)
+    horizon, segments = choose_horizon(Simulator(whole, (), grid), everything, grid)
+    say(say_horizon(everything, horizon))
     simulator, finer = (
         Simulator(model, (*shared, *others), grid, refine, acting=range(len(shared)))
         for refine in (1, 2)
     )
+    warnings = warn_of_divergence(simulator, finer, everything, grid, horizon)
     sample = grid.interval * grid.per_sample
     suggested = suggest(simulator.effects, host, fitted)
     seen = segments.recording < len(fitted)
@@ -74,7 +81,7 @@ def diagnose(
     problem = trusted(problem, settled)
     outcome = explain(problem, settled.start, say, lambda p, t: cut_longer(p, everything, grid, t))
     problem = outcome.problem
-    error = _errors(problem, outcome, host, how)
+    error = _errors(problem, outcome, host, how, grid.timestep)
     return Diagnosis(
         model=str(model.path),
         data=tuple(r.name for r in fitted),
@@ -89,6 +96,7 @@ def diagnose(
         ladder=_ladder(problem, outcome),
         drifts=find_drifts(problem, outcome.best, everything) if outcome.best else (),
         next_experiment=next_experiment((*outcome.selected, *outcome.candidates[:1])),
+        warnings=warnings,
     )
 
 
@@ -152,23 +160,19 @@ def metric_in_words(problem: Problem, how: str) -> str:
 
 
 def _verdict(outcome: Outcome, error: Errors) -> Verdict:
-    if outcome.adequate:
+    if outcome.adequate and not error.is_too_coarse:
         return "adequate"
     return "missing_effect" if outcome.selected and is_explained(error) else "unexplained"
 
 
 def is_explained(error: Errors) -> bool:
     """Say whether what is left is hardly any of the error, or little and near the noise floor."""
-    near_floor = error.after <= ABOVE_FLOOR * error.noise_floor
     share = error.unexplained_share
-    return share <= SMALLEST_SHARE or (near_floor and share <= UNEXPLAINED)
+    return share <= SMALLEST_SHARE or (error.is_near_floor and share <= UNEXPLAINED)
 
 
-def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str) -> Errors:
+def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str, timestep: float):
     metric, held_out = make_metric(problem), ~problem.fitted
-    before = metric.error(outcome.before.residual, held_out)
-    after = metric.error(outcome.after.residual, held_out)
-    rest = np.sqrt(max(after**2 - outcome.floor**2, 0.0))
     segments = problem.segments
     shape = (-1, *segments.measured.shape[1:])
     listed = signals(host)
@@ -189,13 +193,13 @@ def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str) 
             "noise_floor": noise,
             "unit": listed[i].unit,
         }
-    return Errors(
+    return Errors.above(
+        outcome.floor,
+        metric.of_noise(held_out),
         metric=metric_in_words(problem, how),
-        unit="1",
-        before=before,
-        after=after,
-        noise_floor=outcome.floor,
-        unexplained_share=float(rest / before) if before > 0 else 0.0,
+        before=metric.error(outcome.before.residual, held_out),
+        after=metric.error(outcome.after.residual, held_out),
+        timestep=timestep,
         per_signal=per_signal,
     )
 

@@ -62,13 +62,13 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
     return Exported(path, unsaid)
 
 
-def copy_model(model: Model, folder: Path) -> Path:
-    """Copy a model's MJCF file and all files that it needs into a folder, and return its path.
+def needed_files(model: Model) -> list[Path]:
+    """List a model's MJCF file and all files that it needs, relative to its folder.
 
     Raises:
         UserError: The model needs a file outside the folder of its MJCF.
     """
-    source = model.mjcf.parent.resolve()
+    source, files = model.mjcf.parent.resolve(), []
     for name in mujoco.mju_getXMLDependencies(str(model.mjcf)):
         file = Path(name).resolve()
         if not file.is_relative_to(source):
@@ -76,9 +76,20 @@ def copy_model(model: Model, folder: Path) -> Path:
                 f"{model.mjcf} needs {file}, outside its folder, so it cannot be copied; "
                 "put it beside the model"
             )
-        target = folder / file.relative_to(source)
+        files.append(file.relative_to(source))
+    return files
+
+
+def copy_model(model: Model, folder: Path) -> Path:
+    """Copy a model's MJCF file and all files that it needs into a folder, and return its path.
+
+    Raises:
+        UserError: The model needs a file outside the folder of its MJCF.
+    """
+    for file in needed_files(model):
+        target = folder / file
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, target)
+        shutil.copyfile(model.mjcf.parent / file, target)
     return folder / model.mjcf.name
 
 

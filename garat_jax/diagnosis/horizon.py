@@ -9,6 +9,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.problem import AnyProblem, Predictor
 from garat_jax.diagnosis.segments import QUIET, Grid, Segments, cut
 from garat_jax.diagnosis.starts import Fit, settle
+from garat_jax.errors import UserError
 
 HORIZONS = (2.0, 1.0, 0.5, 0.3, 0.2)
 """Seconds that a segment may last, longest first."""
@@ -24,6 +25,9 @@ BEYOND = 4.0
 """Standard deviations of its noise that the error of a signal may reach by noise alone."""
 MOST = 0.9
 """Share of the segments that must keep below both."""
+GONE = 100.0
+"""Spreads of a signal that a prediction may be off before it counts as diverged, if half the
+timestep makes most of that: a model that only lacks an effect errs alike at any timestep."""
 
 
 def choose_horizon(
@@ -46,6 +50,58 @@ def choose_horizon(
         if all(_is_within(sizes) for sizes in within):
             break
     return horizon, segments if horizon == horizons[0] else cut(recordings, grid, horizon)
+
+
+def warn_of_divergence(
+    simulator: Predictor,
+    finer: Predictor,
+    recordings: Sequence[Recording],
+    grid: Grid,
+    horizon: float,
+) -> tuple[str, ...]:
+    """Say in words where the model as it is diverges at its timestep; nothing where it does not.
+
+    Args:
+        simulator: The model.
+        finer: The same with half the physics timestep.
+        recordings: What was measured.
+        grid: The simulated steps.
+        horizon: What `choose_horizon` chose.
+
+    Raises:
+        UserError: It diverges even within the shortest segments.
+    """
+    longest = _possible(recordings)[0]
+    segments = cut(recordings, grid, longest)
+    predicted, halved = (
+        s.predict(s.base[None], segments.start[None], segments)[0] for s in (simulator, finer)
+    )
+    diverges, samples = _gone(predicted, halved, segments)
+    if not np.any(diverges):
+        return ()
+    seconds = samples * grid.interval * grid.per_sample
+    early = np.mean(diverges & (seconds <= HORIZONS[-1]))
+    when = (
+        f"the model diverges within {np.median(seconds[diverges]):.2g} s of a measured state at a "
+        f"timestep of {grid.timestep:g} s"
+    )
+    if early > 1.0 - MOST:
+        raise UserError(
+            f"{when}, so that no recording can be followed; give it a smaller timestep, an "
+            "implicit integrator or softer gains"
+        )
+    cut_to = f"; segments were shortened to {horizon:g} s" if horizon < longest else ""
+    return (f"{when}, in {diverges.sum()} of {len(diverges)} segments{cut_to}",)
+
+
+def say_horizon(recordings: Sequence[Recording], horizon: float) -> str:
+    """Say how long segments are, and why they are no longer."""
+    if horizon == _possible(recordings)[0]:
+        return f"following the recordings for {horizon:g} s at a time"
+    return (
+        f"segments were shortened to {horizon:g} s: within longer ones the model's error, or a "
+        "small change of its initial state, grows too much"
+    )
 
 
 def cut_longer(
@@ -105,6 +161,17 @@ def _growth(predicted: np.ndarray, segments: Segments) -> np.ndarray:
     by_size = zip(np.split(change, len(PERTURBATIONS)), PERTURBATIONS, strict=True)
     growth = np.min([_or_inf(part.max(axis=(0, 3)) / size) for part, size in by_size], axis=0)
     return growth / LARGEST_GROWTH
+
+
+def _gone(
+    predicted: np.ndarray, halved: np.ndarray, segments: Segments
+) -> tuple[np.ndarray, np.ndarray]:
+    """Say which segments diverge at the timestep, [S] bool, and at which sample each does, [S]."""
+    off = _or_inf(np.abs(predicted - segments.measured) / segments.spread)
+    changed = _or_inf(np.abs(predicted - halved) / segments.spread)
+    gone = (off > GONE) & (changed >= 0.5 * off) & (segments.weight[..., None] > 0)
+    gone = np.any(gone, axis=2)
+    return np.any(gone, axis=1), np.argmax(gone, axis=1)
 
 
 def _error(predicted: np.ndarray, segments: Segments) -> np.ndarray:

@@ -13,7 +13,7 @@ from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.conditions import add_conditions, read_conditions, write_cards
 from garat_jax.diagnosis.diagnose import diagnose, is_explained, metric_in_words, split, thin
-from garat_jax.diagnosis.export import copy_model
+from garat_jax.diagnosis.export import copy_model, needed_files
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric, noise_floor
@@ -133,16 +133,12 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     if not added:
         return first
     ladder, per_signal, floor, metric = _ladder(model, recordings, holdout, added)
-    before, after = ladder[0].error_holdout, ladder[-1].error_holdout
-    rest = float(np.sqrt(max(after**2 - floor**2, 0.0)))
-    share = rest / before if before > 0 else 0.0
-    error = dataclasses.replace(
-        first.error,
+    error = Errors.above(
+        *floor,
         metric=metric,
-        noise_floor=floor,
-        before=before,
-        after=after,
-        unexplained_share=share,
+        before=ladder[0].error_holdout,
+        after=ladder[-1].error_holdout,
+        timestep=first.error.timestep,
         per_signal=_with_after(first.error, per_signal),
     )
     stays = last.verdict == "unexplained" and not is_explained(error)
@@ -162,7 +158,7 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
 
     Returns:
         A rung for each effect, at its final size; each signal's error by their number; the noise
-        floor with all of them; and what the errors are, in words.
+        floor with all of them, and what noise alone makes of it; and what the errors are, in words.
     """
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
@@ -187,7 +183,7 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     )
     by_signal = [metric.by_signal(f.residual, ~seen) * segments.noise for f in fits]
     floor = noise_floor(problem, metric, fits[-1]).error
-    return rungs, by_signal, floor, metric_in_words(problem, how)
+    return rungs, by_signal, (floor, metric.of_noise(~seen)), metric_in_words(problem, how)
 
 
 def _with_after(error: Errors, by_signal: Sequence[np.ndarray]) -> Mapping[str, Mapping[str, Any]]:
@@ -226,9 +222,10 @@ def run_improve(
     loaded = load_model(model, catalogue)
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
     others = read_conditions(loaded, conditions, columns)
-    copied = copy_model(loaded, run.path("model"))
+    needed_files(loaded)  # or the refusal would come at the end
     with progress("looking at the recordings") as say:
         done = improve(loaded, recordings, held_out, say, others)
+        copied = copy_model(loaded, run.path("model"))
         run.write_json("improve.json", finite_or_null(to_plain(done.to_json())))
         write_cards(run, dataclasses.replace(loaded, mjcf=copied), done.diagnosis)
         say("writing the report")

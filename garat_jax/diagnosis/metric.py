@@ -39,6 +39,10 @@ class Metric(NamedTuple):
         """Return how many residuals of the chosen segments count, 1 or more."""
         return max(int(self.counted[chosen].sum()), 1)
 
+    def of_noise(self, chosen: np.ndarray) -> float:
+        """Return the error that noise alone makes in chosen segments."""
+        return self.error(self.counted * self.trust, chosen)
+
     def by_signal(self, residual: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Return the error of each signal in units of its noise, as trusted, [num_signals]."""
         num_signals = len(self.spread)
@@ -106,9 +110,8 @@ def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
     """Estimate the noise floor."""
     held_out = ~problem.fitted
     _, change = timestep_error(problem, current)
-    noise = metric.counted * metric.trust
     return Floor(
-        float(np.hypot(metric.error(noise, held_out), metric.error(change, held_out))),
+        float(np.hypot(metric.of_noise(held_out), metric.error(change, held_out))),
         np.hypot(1.0, metric.by_signal(change, held_out)),
     )
 

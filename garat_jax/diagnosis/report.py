@@ -61,7 +61,17 @@ def write_diagnosis(
 
 def diagnosis_lead(diagnosis: Diagnosis) -> str:
     """Return the result in words for a reader who was not there."""
+    return _with_warnings(_verdict(diagnosis), diagnosis.warnings)
+
+
+def _with_warnings(lead: str, warnings: Sequence[str]) -> str:
+    return " ".join([lead, *(f"{warning[0].upper()}{warning[1:]}." for warning in warnings)])
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
     error = diagnosis.error
+    if error.is_too_coarse:
+        return error.coarseness
     names = " and ".join(_label_with_alike(c) for c in diagnosis.selected)
     floor = f"noise alone makes {_percent(error.noise_floor)}"
     if diagnosis.verdict == "adequate":
@@ -150,7 +160,7 @@ def write_comparison(
         run.path("report.html"),
         kind="A model against measurements",
         title=f"Comparison of {model.name}",
-        lead=comparison.sentence,
+        lead=_with_warnings(comparison.sentence, comparison.warnings),
         facts=facts,
         sections=[
             *side_by_side_section(comparison),
@@ -378,7 +388,7 @@ def _next(diagnosis: Diagnosis) -> list[Section]:
 
 
 def _left(diagnosis: Diagnosis, view: View) -> list[Section]:
-    if diagnosis.verdict != "unexplained":
+    if diagnosis.verdict != "unexplained" or diagnosis.error.is_too_coarse:
         return []
     evidence = "\n".join(f"- {place.evidence}" for place in leftover(view)[:3])
     text = evidence or "The torque that is still missing follows no simple pattern."

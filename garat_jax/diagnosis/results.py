@@ -9,6 +9,7 @@ from typing import Any, Literal
 import plotly.graph_objects as go
 
 from garat_jax.diagnosis.localise import Place
+from garat_jax.diagnosis.metric import ABOVE_FLOOR
 from garat_jax.errors import choose
 from garat_jax.runs import finite_or_null, to_plain
 
@@ -18,6 +19,9 @@ OFFER = (
     "MODEL DATA... --method gat, or garat; garat compare --grounded then says how much that is."
 )
 """What is said where the verdict is `unexplained`."""
+TOO_COARSE = 1.0 / ABOVE_FLOOR
+"""Integrator's error, relative to the signals' spread, above which a model that is as bad as always
+predicting the mean would be near the floor."""
 Verdict = Literal["adequate", "missing_effect", "unexplained"]
 
 
@@ -113,8 +117,10 @@ class Errors:
         before: Of the model as it is.
         after: With every selected effect.
         noise_floor: What noise and the integrator's own error make.
-        unexplained_share: What is left above the floor, over `before`.
+        unexplained_share: What is left above the floor, over `before`; 1 if that is too coarse.
         per_signal: By signal: before, after, noise_floor and the signal's unit, in that unit.
+        timestep: Seconds of a step of the physics.
+        integrator: What the integrator's error alone makes at this timestep.
     """
 
     metric: str
@@ -124,6 +130,46 @@ class Errors:
     noise_floor: float
     unexplained_share: float
     per_signal: Mapping[str, Mapping[str, float | str]]
+    timestep: float = math.nan
+    integrator: float = 0.0
+
+    @classmethod
+    def above(
+        cls,
+        floor: float,
+        of_noise: float,
+        *,
+        metric: str,
+        before: float,
+        after: float,
+        timestep: float,
+        per_signal: Mapping[str, Mapping[str, float | str]],
+    ) -> "Errors":
+        """Hold errors against their floor, of which noise alone makes `of_noise`."""
+        integrator = math.sqrt(max(floor**2 - of_noise**2, 0.0))
+        rest = math.sqrt(max(after**2 - floor**2, 0.0))
+        share = rest / before if before > 0 else 0.0
+        share = 1.0 if integrator > TOO_COARSE else share
+        return cls(metric, "1", before, after, floor, share, per_signal, timestep, integrator)
+
+    @property
+    def is_too_coarse(self) -> bool:
+        """Whether the integrator's error would hide any other, so that nothing can be judged."""
+        return self.integrator > TOO_COARSE
+
+    @property
+    def is_near_floor(self) -> bool:
+        """Whether what is left is what noise, and an integrator that can be trusted, make."""
+        return self.after <= ABOVE_FLOOR * self.noise_floor and not self.is_too_coarse
+
+    @property
+    def coarseness(self) -> str:
+        """That nothing can be judged, in one sentence."""
+        return (
+            f"The model cannot be judged at a timestep of {self.timestep:g} s: the integrator's "
+            f"error alone is {100 * self.integrator:.0f} % of the signals' spread. Give it a "
+            "smaller timestep, an implicit integrator or softer gains."
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,6 +288,7 @@ class Diagnosis:
     next_experiment: Experiment | None
     drifts: tuple[Drift, ...] = ()
     repeatability: tuple[Repeated, ...] = ()
+    warnings: tuple[str, ...] = ()
     conditions: Mapping[str, "Diagnosis"] = dataclasses.field(default_factory=dict)
 
     def added(self, rung: Rung) -> str:
@@ -285,6 +332,8 @@ class Diagnosis:
     def sentence(self) -> str:
         """What is wrong, in one sentence."""
         error = self.error
+        if error.is_too_coarse:
+            return error.coarseness
         fall = f"held-out error {error.before:.3g} → {error.after:.3g}"
         floor = f"{error.noise_floor:.3g}"
         if self.verdict == "adequate":
@@ -302,6 +351,7 @@ class Diagnosis:
 
     def __str__(self) -> str:
         lines = [self.sentence]
+        lines += [f"  warning: {warning}" for warning in self.warnings]
         lines += [f"  where: {place.evidence}" for place in self.where[:3]]
         for c in self.candidates[:6]:
             fitted = f", held-out error {c.error_after:.3g}, stability {c.stability:.2f}"
@@ -315,7 +365,7 @@ class Diagnosis:
         lines += [f"  drift: {drift}" for drift in self.drifts]
         if self.next_experiment:
             lines.append(f"  next: {self.next_experiment.how}")
-        if self.verdict == "unexplained":
+        if self.verdict == "unexplained" and not self.error.is_too_coarse:
             lines.append(f"  or: {OFFER}")
         return "\n".join([*lines, *self.other_conditions])
 

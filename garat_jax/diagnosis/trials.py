@@ -150,7 +150,8 @@ def enlarge(
         p = simulator.slots[row.column].parameter
         base = row.values[row.column] - row.step
         room = abs((p.high if row.step > 0 else p.low) - base)
-        step = np.sign(row.step) * min(wanted / median * abs(row.step), ROOM * room)
+        times = wanted / median if median > 0 else np.inf
+        step = np.sign(row.step) * min(times * abs(row.step), ROOM * room)
         if abs(step) > abs(row.step):
             start = {row.column: base + step}
             larger[index] = Row(row.column, start, step, -1), trial._replace(start=start)

@@ -47,6 +47,10 @@ def test_steps_grow_where_few_samples_make_the_change():
     p = simulator.slots[row.column].parameter
     far, _ = enlarge(simulator, rows, trials, changes, np.full(1000, 1e9))[friction]
     assert far.step == pytest.approx(0.3 * (p.high - p.low))
+    changes[:, friction] = np.where(np.arange(1000) % 100, 0.0, 1.0)
+    changes[0, friction] = 1e3  # most samples do not change at all
+    rare, _ = enlarge(simulator, rows, trials, changes, np.full(1000, 0.5))[friction]
+    assert rare.step == pytest.approx(0.3 * (p.high - p.low))
 
 
 def test_samples_that_half_a_timestep_changes_count_less_and_are_reported_as_they_are():
