@@ -209,7 +209,7 @@ class Ground(WithHoldout):
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Plan an excitation, within the actuators' limits, that tells two effects apart."""
+    """Plan an excitation that tells two effects apart, within the actuators' and joints' limits."""
 
     model: Annotated[Positional[Path], arg(metavar="MODEL")]
     """MJCF (.xml) or model card (.toml)."""

@@ -1,15 +1,16 @@
-"""Plan an excitation, within the actuators' limits, that tells two effects apart.
+"""Plan an excitation, within the limits of actuators and joints, that tells two effects apart.
 
 What an effect changes in the signals, without what a free initial state can make, is a direction.
 Where two directions are parallel, no fit can tell the effects apart. Random multi-sines, step
 trains and chirps are tried, and the best one is varied; the angle decides, and that both
-effects show.
+effects show. One under which a joint of the model leaves its range is made smaller until none does.
 """
 
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.convert import write_csv
@@ -19,8 +20,7 @@ from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
-from garat_jax.effects import Effect
-from garat_jax.effects.base import element_names
+from garat_jax.effects.base import DOFS_OF_JOINT, element_names
 from garat_jax.errors import UserError, choose, unknown_name
 
 RATE = 100.0
@@ -31,8 +31,10 @@ TRIALS = 12
 """Random excitations that are tried."""
 VARIATIONS = 12
 """Variations of the best one."""
-UNLIMITED = 1.0
-"""Command taken as the limit of an actuator that states none."""
+HALVINGS = 8
+"""How often an excitation under which a joint leaves its range is halved before it is given up."""
+BEYOND = 1e-3
+"""How far a joint may be beyond its range, more than at rest, relative to the range."""
 VISIBLE = 1e-3
 """Change of the signals, relative to the larger effect's, below which an effect does not show."""
 
@@ -101,20 +103,18 @@ def plan(
         say: Told what is being done.
 
     Raises:
-        UserError: The model has no actuators, the effects are the same, or one shows in nothing.
+        UserError: The model has no actuators or one without limits, the effects are the same, or
+            one shows in nothing.
     """
     host = native_model(model.compile(engine="mujoco"))
-    if host.nu == 0:
-        raise UserError(f"{model.path} has no actuators, so nothing can be commanded")
+    limits = _limits(model, host)
     if first == second:
         raise UserError(f"{first} and {second} are the same; name two effects")
-    limited = host.actuator_ctrllimited.astype(bool)[:, None]
-    limits = np.where(limited, host.actuator_ctrlrange, [-UNLIMITED, UNLIMITED])
     time = np.arange(round(seconds * RATE)) / RATE
-    judge = _Judge(model, (first, second), time, (host.nq, host.nv, host.nu))
+    judge = _Judge(model, (first, second), time, limits)
     rng = np.random.default_rng(seed)
-    plain = _scaled(np.sin(2 * np.pi * 0.5 * time)[:, None] * np.ones(host.nu), limits, 0.3, 0.0)
-    before = judge(plain)
+    sine = np.sin(2 * np.pi * 0.5 * time)[:, None] * np.ones(host.nu)
+    before, plain = judge(sine, 0.3, 0.0)
     best = (np.inf, plain, "a sine", None)
     for trial in range(TRIALS + VARIATIONS):
         say(f"trying excitation {trial + 1} of {TRIALS + VARIATIONS}")
@@ -125,13 +125,15 @@ def plan(
             shape, family, amplitude, bias = best[3]
             amplitude = float(np.clip(amplitude * np.exp(rng.normal(0, 0.4)), 0.05, 1.0))
             bias = float(np.clip(bias + rng.normal(0, 0.2), -0.9, 0.9))
-        ctrl = _scaled(shape, limits, amplitude, bias)
-        cosine = judge(ctrl)
+        cosine, ctrl = judge(shape, amplitude, bias)
         if cosine < best[0]:
             best = (cosine, ctrl, family, (shape, family, amplitude, bias))
     if not np.isfinite(best[0]):
-        raise UserError(f"no excitation was found under which both {first} and {second} show")
-    return Planned(time, best[1], best[2], before, best[0])
+        raise UserError(
+            f"no excitation was found under which both {first} and {second} show "
+            "and all joints stay within their ranges"
+        )
+    return Planned(time, best[1], best[2], min(before, 1.0), best[0])
 
 
 def write_plan(planned: Planned, model: Model, path: Path) -> Path:
@@ -158,6 +160,20 @@ def _draw(number: int, time: np.ndarray, num: int, rng: np.random.Generator):
     return np.sin(2 * np.pi * rate[:, None] * time[:, None] + rng.uniform(0, 6, num)), "a chirp"
 
 
+def _limits(model: Model, host: mujoco.MjModel) -> np.ndarray:
+    """Return the least and the largest command of each actuator, [nu, 2]."""
+    if host.nu == 0:
+        raise UserError(f"{model.path} has no actuators, so nothing can be commanded")
+    free = np.flatnonzero(~host.actuator_ctrllimited.astype(bool))
+    if free.size:
+        names = element_names(host, "actuator")
+        raise UserError(
+            f"{model.path}: no ctrlrange at {', '.join(names[i] or f'actuator {i}' for i in free)}"
+            ", so nothing says how large a command may be; give one in the MJCF or by an override"
+        )
+    return host.actuator_ctrlrange
+
+
 def _scaled(shape: np.ndarray, limits: np.ndarray, amplitude: float, bias: float) -> np.ndarray:
     """Put a shape within -1 to 1 into the limits, [T, nu]."""
     middle, half = limits.mean(axis=1), 0.5 * (limits[:, 1] - limits[:, 0])
@@ -167,39 +183,59 @@ def _scaled(shape: np.ndarray, limits: np.ndarray, amplitude: float, bias: float
 class _Judge:
     """Tells how alike two effects are under an excitation."""
 
-    def __init__(self, model: Model, places: tuple[Place, Place], time, shape):
-        self._time = time
-        self._shape, num_u = shape[:2], shape[2]
-        effects = tuple(self._nominal(model, place) for place in places)
-        still = self._recording(np.zeros((len(time), num_u)))
-        timestep = model.compile(engine="mujoco").host.model.opt.timestep
-        self._grid = choose_grid([still], timestep)
+    def __init__(self, model: Model, places: tuple[Place, Place], time, limits: np.ndarray):
+        self._time, self._limits = time, limits
+        self._host = host = model.compile(engine="mujoco").host.model
+        effects = []
+        for kind, target in places:
+            cls = model.catalogue[kind]
+            effects.append(cls(target=target, **cls.at(host, target)))
+        rest = np.concatenate([host.qpos0, np.zeros(host.nv)])
+        self._resting = np.tile(rest, (len(time), 1))
+        still = self._recording(self._resting, np.zeros((len(time), host.nu)))
+        self._grid = choose_grid([still], host.opt.timestep)
         self._simulator = Simulator(model, effects, self._grid)
-        host = self._simulator.host
-        self._rest = host.qpos0.copy()
         self._sizes = [type(e).starts(host, e.target)[0] for e in effects]
 
-    @staticmethod
-    def _nominal(model: Model, place: Place) -> Effect:
-        cls = model.catalogue[place.kind]
-        return cls(target=place.target, **{p.name: p.nominal for p in cls.parameters()})
+    def _recording(self, path: np.ndarray, ctrl: np.ndarray) -> Recording:
+        qpos, qvel = np.split(path, [self._host.nq], axis=1)
+        return Recording("plan", self._time, qpos, qvel, ctrl, {}, True, ((0, len(path)),), ())
 
-    def _recording(self, ctrl: np.ndarray) -> Recording:
-        num = len(self._time)
-        nothing = np.zeros((num, self._shape[0])), np.zeros((num, self._shape[1]))
-        return Recording("plan", self._time, *nothing, ctrl, {}, True, ((0, num),), ())
+    def __call__(self, shape: np.ndarray, amplitude: float, bias: float):
+        """Return the cosine of the two effects, and the commands that were judged, [T, nu].
 
-    def __call__(self, ctrl: np.ndarray) -> float:
-        """Return the cosine of the two effects, infinite if one does not show or it diverges."""
-        simulator, recording = self._simulator, self._recording(ctrl)
-        whole = cut([recording], self._grid, len(self._time) / RATE)
-        rest = np.concatenate([self._rest, np.zeros(self._shape[1])])
-        path = simulator.predict(simulator.base[None], rest[None, None], whole)[0, 0]
-        if not np.isfinite(path).all():
-            return np.inf
-        qpos, qvel = np.split(path, [self._shape[0]], axis=1)
-        moved = Recording("plan", self._time, qpos, qvel, ctrl, {}, True, recording.spans, ())
-        segments = cut([moved], self._grid, HORIZON)
+        It is infinite if one effect does not show, or a joint leaves its range however small the
+        commands are.
+        """
+        for part in 0.5 ** np.arange(HALVINGS):
+            ctrl = _scaled(shape, self._limits, part * amplitude, part * bias)
+            path = self._path(ctrl)
+            if self._is_within(path):
+                return self._cosine(path, ctrl), ctrl
+        return np.inf, _scaled(shape, self._limits, 0.0, 0.0)
+
+    def _path(self, ctrl: np.ndarray) -> np.ndarray:
+        """Return the states that commands lead to from rest, [T, nq + nv]."""
+        still = self._recording(self._resting, ctrl)
+        whole = cut([still], self._grid, len(ctrl) / RATE)
+        base, start = self._simulator.base[None], self._resting[:1]
+        return self._simulator.predict(base, start[None], whole)[0, 0]
+
+    def _is_within(self, path: np.ndarray) -> bool:
+        """Say whether the motion stays finite and every joint in its range, as far as at rest."""
+        host = self._host
+        single = np.asarray([DOFS_OF_JOINT[int(kind)] == 1 for kind in host.jnt_type], bool)
+        joints = np.flatnonzero(single & (host.jnt_limited != 0))
+        low, high = host.jnt_range[joints].T
+        position = path[:, host.jnt_qposadr[joints]]
+        beyond = np.maximum(low - position, position - high) / (high - low)
+        allowed = BEYOND + np.maximum(beyond[0], 0.0)
+        return bool(np.isfinite(path).all() and np.all(beyond <= allowed))
+
+    def _cosine(self, path: np.ndarray, ctrl: np.ndarray) -> float:
+        """Return the cosine of the two effects, infinite if one does not show."""
+        simulator = self._simulator
+        segments = cut([self._recording(path, ctrl)], self._grid, HORIZON)
         everywhere = np.ones(len(segments.start), bool)
         problem = Problem(simulator, simulator, segments, everywhere, 1.0 / RATE)
         lin = linearise(problem, simulator.base, segments.start, (), ())

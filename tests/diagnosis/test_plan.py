@@ -1,5 +1,6 @@
 """`garat plan`: within the limits, and better at telling effects apart than a plain sine."""
 
+import mujoco
 import numpy as np
 import pandas as pd
 import pytest
@@ -57,6 +58,45 @@ def test_refusals(pendulum, capsys, arguments, said):
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
     assert not out.exists()
+
+
+def test_a_gain_is_told_from_a_payload_at_the_centre_of_mass(pendulum):
+    model = load_model(pendulum)
+    places = Place("motor_gain", "actuator/motor"), Place("payload_mass", "body/pole")
+    planned = plan(model, *places, seconds=4.0)
+    assert planned.after < 0.9
+    assert planned.after <= planned.before
+
+
+@pytest.mark.parametrize("kind", ["motor", "position"])
+def test_joints_stay_within_their_ranges(tmp_path, kind):
+    mjcf = models.PENDULUM.replace('damping="0.01"', 'damping="0.01" range="-20 35"')
+    if kind == "position":
+        mjcf = mjcf.replace("<motor", '<position kp="20" kv="2"')
+    path = tmp_path / "limited.xml"
+    path.write_text(mjcf)
+    model = load_model(path)
+    places = Place("viscous_damping", "joint/hinge"), Place("coulomb_friction", "joint/hinge")
+    planned = plan(model, *places, seconds=3.0)
+    host = model.spec.copy().compile()
+    data = mujoco.MjData(host)
+    angles = []
+    for ctrl in planned.ctrl:
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(host, data, 5)
+        angles.append(data.qpos[0])
+    low, high = np.deg2rad([-20.1, 35.1])
+    assert low < min(angles) < -0.05 < 0.05 < max(angles) < high
+    assert planned.after < 0.99
+
+
+def test_an_actuator_without_limits_is_refused(tmp_path, capsys):
+    path = tmp_path / "arm.xml"
+    path.write_text(models.ARM)
+    separate = ["--separate", "viscous_damping@joint/elbow", "rotor_inertia@joint/elbow"]
+    assert cli.main(["plan", str(path), *separate, "--out", str(tmp_path / "x.csv")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no ctrlrange at shoulder, elbow, so nothing says how large" in line
 
 
 def test_a_model_without_actuators_is_refused(tmp_path, capsys):
