@@ -94,8 +94,8 @@ def learn(world: World, config: TRPOConfig, seeds: int, steps: int) -> np.ndarra
         return agent.mean(params, obs), jnp.zeros(())
 
     def evaluate(state, key: jax.Array) -> jax.Array:
-        returns = rollout.evaluate(world.env, world.params, acting, state.policy, key, EPISODES)
-        return returns.mean()
+        found = rollout.evaluate(world.env, world.params, acting, state.policy, key, EPISODES)
+        return found.returns.mean()
 
     def iterate(state):
         return jax.vmap(agent.step, (0, None))(state, world.params)[0]

@@ -15,6 +15,9 @@ from garat_jax.dynamics import Dynamics, PhysicsState
 from garat_jax.overrides import load_spec
 from garat_jax.types import Params
 
+LARGEST = 1e10
+"""Absolute value beyond which a state has exploded; MuJoCo's own limit, mjMAXVAL."""
+
 
 class EnvState(NamedTuple):
     """One environment between two steps.
@@ -37,6 +40,20 @@ class StepResult(NamedTuple):
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
+
+
+class GuardedStep(NamedTuple):
+    """What a guarded step gave.
+
+    Attributes:
+        result: What to go on with; see `guarded_step`.
+        faulty: Whether physics left the finite numbers, [].
+        after: The state that came of it, as it was.
+    """
+
+    result: StepResult
+    faulty: jax.Array
+    after: EnvState
 
 
 class Task(abc.ABC):
@@ -156,6 +173,28 @@ class TaskEnv(Env):
     def _observe(self, params: Dynamics, physics: PhysicsState) -> jax.Array:
         """Return the observation [obs_size] of what the sensors report."""
         return self.task.observe(dynamics.sensed(params, physics))
+
+
+def guarded_step(
+    env: Env, params: Params, state: EnvState, action: jax.Array, key: jax.Array
+) -> GuardedStep:
+    """Take one control step, and end the episode if physics leaves the finite numbers in it.
+
+    Such a step counts as terminated, earns nothing, and stays in the state that it began in, the
+    last sound one. Arguments are those of `Env.step`.
+    """
+    after, reward, terminated, truncated = env.step(params, state, action, key)
+    faulty = ~_is_sound((after, reward))
+    kept = jax.tree.map(lambda old, new: jnp.where(faulty, old, new), state, after)
+    reward = jnp.where(faulty, 0.0, reward)
+    result = StepResult(kept, reward, terminated | faulty, truncated & ~faulty)
+    return GuardedStep(result, faulty, after)
+
+
+def _is_sound(values: Any) -> jax.Array:
+    """Say whether every float is finite and within MuJoCo's limit, []."""
+    floats = [x for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.stack([jnp.all(jnp.abs(x) < LARGEST) for x in floats]).all()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,21 +1,21 @@
-"""The only callers of `Env.step`: batches of experience, evaluation, recorded transitions.
+"""Batches of experience, evaluation, recorded transitions: all in guarded steps.
 
-A world whose physics leaves the finite numbers ends its episode: the step counts as terminated,
-with no reward and nothing seen after it. It is counted, and the first such step of a batch is
-kept as it was, so that nothing is hidden.
+A world whose physics leaves the finite numbers ends its episode (`env.guarded_step`). The step is
+counted wherever worlds are stepped, and the first one of a batch of experience is kept as it was,
+so that nothing is hidden.
 """
 
-from typing import NamedTuple
+import functools
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 
 from garat_jax import split
-from garat_jax.env import Env, EnvState
+from garat_jax.env import Env, EnvState, guarded_step
 from garat_jax.types import Params, Policy, Transition
 
-LARGEST = 1e10
-"""Absolute value beyond which a state has exploded; MuJoCo's own limit, mjMAXVAL."""
+Tree = TypeVar("Tree")
 
 
 class Fault(NamedTuple):
@@ -41,6 +41,18 @@ class Recorded(NamedTuple):
     states: EnvState
 
 
+class Evaluation(NamedTuple):
+    """What whole episodes gave.
+
+    Attributes:
+        returns: Undiscounted, [num_episodes].
+        faulty_share: Share of their steps in which physics left the finite numbers, [].
+    """
+
+    returns: jax.Array
+    faulty_share: jax.Array
+
+
 def reset(env: Env, params: Params, key: jax.Array, num_envs: int) -> EnvState:
     """Start a batch of episodes [B]."""
     return jax.vmap(env.reset, (None, 0))(params, jax.random.split(key, num_envs))
@@ -56,29 +68,32 @@ def _step(env: Env, params: Params, policy: Policy, policy_params: Params, state
     """Step a batch [B], or this device's share of one, and reset what has ended.
 
     Returns:
-        The next states, the transitions, and faults with the true next states.
+        The next states, the transitions, and the true next states.
     """
     num_envs = state.steps.shape[0] * shares
     keys = jax.random.split(key, (3, num_envs))
     act_keys, step_keys, reset_keys = split.own_share(keys, shares, axis=1)
     action, log_prob = jax.vmap(policy, (None, 0, 0))(policy_params, state.obs, act_keys)
-    result = jax.vmap(env.step, (None, 0, 0, 0))(params, state, action, step_keys)
-    faulty = ~jax.vmap(_is_sound)((result.state, result.reward))
-    terminated = result.terminated | faulty
-    truncated = result.truncated & ~faulty
+    result, faulty, after = _guarded_steps(env, params, state, action, step_keys)
     transition = Transition(
         obs=state.obs,
         action=action,
-        reward=jnp.where(faulty, 0.0, result.reward),
-        next_obs=jnp.where(faulty[:, None], state.obs, result.state.obs),
-        terminated=terminated,
-        truncated=truncated,
+        reward=result.reward,
+        next_obs=result.state.obs,
+        terminated=result.terminated,
+        truncated=result.truncated,
         log_prob=log_prob,
+        faulty=faulty,
     )
     fresh = jax.vmap(env.reset, (None, 0))(params, reset_keys)
-    done = terminated | truncated
+    done = result.terminated | result.truncated
+    return _select(done, fresh, result.state), transition, after
 
-    return _select(done, fresh, result.state), transition, (faulty, action, result.state)
+
+def _guarded_steps(env: Env, params: Params, states: EnvState, actions: jax.Array, keys: jax.Array):
+    """Take one guarded step in each of a batch of environments [B]."""
+    step = functools.partial(guarded_step, env)
+    return jax.vmap(step, (None, 0, 0, 0))(params, states, actions, keys)
 
 
 def _select(chosen: jax.Array, these: EnvState, others: EnvState) -> EnvState:
@@ -90,17 +105,11 @@ def _select(chosen: jax.Array, these: EnvState, others: EnvState) -> EnvState:
     return jax.tree.map(select, these, others)
 
 
-def _is_sound(values) -> jax.Array:
-    """Say whether every float is finite and within MuJoCo's limit, []."""
-    floats = [x for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.floating)]
-    return jnp.stack([jnp.all(jnp.abs(x) < LARGEST) for x in floats]).all()
-
-
-def _note(fault: Fault, before: EnvState, outcome) -> Fault:
+def _note(fault: Fault, before: EnvState, transition: Transition, after: EnvState) -> Fault:
     """Count the faulty steps of a batch [B] and keep the first of all."""
-    faulty, action, after = outcome
+    faulty = transition.faulty
     worst = jnp.argmax(faulty)
-    found = jax.tree.map(lambda x: x[worst], (before, action, after))
+    found = jax.tree.map(lambda x: x[worst], (before, transition.action, after))
     is_first = (fault.num_steps == 0) & faulty[worst]
     kept = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), found, tuple(fault[1:]))
     return Fault(fault.num_steps + faulty.sum(), *kept)
@@ -133,8 +142,8 @@ def unroll(
 
     def step(carry, key):
         state, fault = carry
-        after, transition, outcome = _step(env, params, policy, policy_params, state, key, shares)
-        return (after, _note(fault, state, outcome)), transition
+        new, transition, after = _step(env, params, policy, policy_params, state, key, shares)
+        return (new, _note(fault, state, transition, after)), transition
 
     carry = (split.own_share(state, shares), no_fault(env, state))
     (state, fault), transitions = jax.lax.scan(step, carry, jax.random.split(key, length))
@@ -153,7 +162,10 @@ def record(
     num_envs: int,
     length: int,
 ) -> Recorded:
-    """Collect transitions from fresh episodes, with the states they began in, [T, B]."""
+    """Collect transitions from fresh episodes, with the states they began in, [T, B].
+
+    Who learns from what happened leaves out what did not, with `without_faults`.
+    """
 
     def step(state, key):
         after, transition, _ = _step(env, params, policy, policy_params, state, key)
@@ -164,6 +176,26 @@ def record(
     return jax.lax.scan(step, state, jax.random.split(key, length))[1]
 
 
+def without_faults(steps: Tree, faulty: jax.Array) -> Tree:
+    """Put a sound step of a batch in the place of each faulty one, as nothing sound followed that.
+
+    Args:
+        steps: Transitions, or anything else with the leading axes of `faulty`.
+        faulty: In which steps physics left the finite numbers, [...].
+
+    Returns:
+        The steps, with the last sound one before it instead of each faulty one, or else the first.
+    """
+    flat = faulty.reshape(-1)
+    last_sound = jax.lax.cummax(jnp.where(flat, -1, jnp.arange(flat.size)))
+    chosen = jnp.where(last_sound < 0, jnp.argmin(flat), last_sound)
+
+    def choose(x: jax.Array) -> jax.Array:
+        return x.reshape(flat.size, *x.shape[faulty.ndim :])[chosen].reshape(x.shape)
+
+    return jax.tree.map(choose, steps)
+
+
 def evaluate(
     env: Env,
     params: Params,
@@ -172,8 +204,8 @@ def evaluate(
     key: jax.Array,
     num_episodes: int,
     wanted: jax.Array | bool = True,
-) -> jax.Array:
-    """Return undiscounted returns [num_episodes] of whole episodes; stop when all have ended.
+) -> Evaluation:
+    """Let a policy act for whole episodes; stop when all have ended.
 
     An episode that is over idles while others last; see `Env.idle`.
 
@@ -194,25 +226,31 @@ def evaluate(
         return carry[1]
 
     def step(carry):
-        length, _, state, alive, total = carry
+        length, _, state, alive, total, num_steps, num_faults = carry
         key = keys[length]
         idle = jax.vmap(env.idle, (None, 0))(params, state)
         state = _select(alive, state, idle)
         state, transition, _ = _step(env, params, policy, policy_params, state, key, shares)
         total = total + alive * transition.reward
+        num_steps, num_faults = num_steps + alive, num_faults + (alive & transition.faulty)
         alive = alive & ~(transition.terminated | transition.truncated)
         length = length + 1
         goes_on = (length < env.episode_length) & split.anywhere(alive.any())
-        return length, goes_on, state, alive, total
+        return length, goes_on, state, alive, total, num_steps, num_faults
 
     state = split.own_share(reset(env, params, reset_key, num_episodes), shares)
     wanted = jnp.asarray(wanted)
     alive, total = jnp.full(state.steps.shape, wanted), jnp.zeros(state.steps.shape)
-    carry = (0, split.anywhere(wanted), state, alive, total)
-    return split.join(jax.lax.while_loop(is_unfinished, step, carry)[4], shares)
+    nothing = jnp.zeros(state.steps.shape, jnp.int32)
+    carry = (0, split.anywhere(wanted), state, alive, total, nothing, nothing)
+    counts = jax.lax.while_loop(is_unfinished, step, carry)[4:]
+    returns, num_steps, num_faults = split.join(counts, shares)
+    return Evaluation(returns, num_faults.sum() / jnp.maximum(num_steps.sum(), 1))
 
 
-def replay(env: Env, params: Params, recorded: Recorded, key: jax.Array) -> jax.Array:
+def replay(
+    env: Env, params: Params, recorded: Recorded, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Take every recorded action from its recorded state.
 
     Args:
@@ -222,11 +260,13 @@ def replay(env: Env, params: Params, recorded: Recorded, key: jax.Array) -> jax.
         key: PRNG key.
 
     Returns:
-        The observations that follow, [T * B, obs_size].
+        The observations that follow, [T * B, obs_size], and in which of the steps physics left the
+        finite numbers, [T * B]; nothing followed those, and the observation is the one before.
     """
     states, actions = jax.tree.map(
         lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]),
         (recorded.states, recorded.transitions.action),
     )
     keys = jax.random.split(key, actions.shape[0])
-    return jax.vmap(env.step, (None, 0, 0, 0))(params, states, actions, keys).state.obs
+    result, faulty, _ = _guarded_steps(env, params, states, actions, keys)
+    return result.state.obs, faulty

@@ -184,18 +184,36 @@ class Trainer:
         shares = [value for name, value in metrics.items() if name.endswith(FAULTY)]
         share = np.max(shares, axis=0) if shares else np.zeros(len(self.seeds))
         if np.any(share > LARGEST_FAULTY_SHARE):
-            what = (
-                f"saw physics leave the finite numbers in {100 * share.max():.2g} % of the steps "
-                f"(up to {100 * LARGEST_FAULTY_SHARE:g} % is let pass) of"
-            )
+            what = f"{_too_many(share)} of"
             self._diverged(stage, iteration, last, new, share > LARGEST_FAULTY_SHARE, what)
+        self._warn_of_faults(stage, share, f"the steps of iteration {iteration}")
+
+    def check_faults(self, what: str, share: np.ndarray) -> None:
+        """Warn of what was done outside of a stage where it had faulty steps.
+
+        Args:
+            what: Its name.
+            share: Share of its steps in which physics left the finite numbers, [seeds].
+
+        Raises:
+            DivergedError: The share is above `LARGEST_FAULTY_SHARE`.
+        """
+        if np.any(share > LARGEST_FAULTY_SHARE):
+            seeds = self._named(share > LARGEST_FAULTY_SHARE)
+            raise DivergedError(f"{what}: seed {seeds} {_too_many(share)}")
+        self._warn_of_faults(what, share, "the steps")
+
+    def _warn_of_faults(self, what: str, share: np.ndarray, steps: str) -> None:
         if np.any(share > 0):
             self.console.print(
-                f"{stage}: warning: physics left the finite numbers in "
-                f"{100 * share.max():.2g} % of the steps of iteration {iteration}; "
-                "those episodes were ended",
+                f"{what}: warning: physics left the finite numbers in "
+                f"{100 * share.max():.2g} % of {steps}; those episodes were ended",
                 highlight=False,
             )
+
+    def _named(self, bad: np.ndarray) -> str:
+        """Return the seeds that are bad [seeds]."""
+        return ", ".join(str(seed) for seed, is_bad in zip(self.seeds, bad, strict=True) if is_bad)
 
     def _diverged(self, stage: str, iteration: int, last, new, bad: np.ndarray, what: str):
         """Leave the last finite state and the offending one, and say where they are."""
@@ -208,9 +226,8 @@ class Trainer:
         }
         path = self.run.path(f"diverged/{stage}-{iteration}.npz")
         np.savez_compressed(path, allow_pickle=False, **arrays)
-        seeds = [seed for seed, is_bad in zip(self.seeds, bad, strict=True) if is_bad]
         raise DivergedError(
-            f"{stage}: seed {', '.join(map(str, seeds))} {what} iteration {iteration}; "
+            f"{stage}: seed {self._named(bad)} {what} iteration {iteration}; "
             f"the last finite state is in checkpoints/{stage}, the offending one, with the first "
             f"faulty step before and after, in {path}"
         )
@@ -226,6 +243,13 @@ def _memory(compiled: jax.stages.Compiled) -> str:
     return (
         f"{held / 2**20:.1f} MiB of states and {sizes.temp_size_in_bytes / 2**20:.1f} MiB on the "
         f"way in an iteration, {process}"
+    )
+
+
+def _too_many(share: np.ndarray) -> str:
+    return (
+        f"saw physics leave the finite numbers in {100 * share.max():.2g} % of the steps "
+        f"(up to {100 * LARGEST_FAULTY_SHARE:g} % is let pass)"
     )
 
 
@@ -281,8 +305,8 @@ def until_solved(step, evaluate, solved_return: float):
 
     Args:
         step: `(state, params) -> (state, metrics, ...)` of one learner.
-        evaluate: `(state, params, key, wanted) -> mean return` of one learner, which is not looked
-            at where `wanted` is false.
+        evaluate: `(state, params, key, wanted) -> (mean return, share of faulty steps)` of one
+            learner, which is not looked at where `wanted` is false.
         solved_return: Mean return that counts as solved.
 
     Returns:
@@ -294,9 +318,11 @@ def until_solved(step, evaluate, solved_return: float):
         new, metrics = step(state, params)[:2]
         state = jax.tree.map(lambda old, n: jnp.where(solved, old, n), state, new)
         key, evaluate_key = jax.random.split(key)
-        score = jnp.where(solved, score, evaluate(state, params, evaluate_key, ~solved))
+        found, faulty_share = evaluate(state, params, evaluate_key, ~solved)
+        score = jnp.where(solved, score, found)
         solved = score >= solved_return
-        metrics = metrics | {"evaluation": score, "finished": solved}
+        faults = {f"evaluation_{FAULTY}": faulty_share}
+        metrics = metrics | {"evaluation": score, "finished": solved} | faults
         return UntilSolved(state, score, solved, key), metrics
 
     return stepped

@@ -24,7 +24,7 @@ from garat_jax.effects import Effect
 from garat_jax.env import Env, Task, World, make_world
 from garat_jax.methods.garat import GARAT, GARATConfig
 from garat_jax.methods.gat import GAT, GATConfig
-from garat_jax.methods.grounded import GroundedEnv, Grounding
+from garat_jax.methods.grounded import GroundedEnv, Grounding, action_noise
 from garat_jax.methods.transition_error import best_constant, constant_error, transition_error
 from garat_jax.rollout import Recorded
 from garat_jax.runs import RunDirectory
@@ -139,17 +139,12 @@ class Experiment:
         """Train policies [seeds] from scratch until each solves a world, and say which did."""
         config, agent = self.config, self.worlds.agent
 
-        def evaluate(state: ActorCriticState, params: Params, key: jax.Array, wanted) -> jax.Array:
-            returns = rollout.evaluate(
-                world.env,
-                params,
-                agent.policy,
-                state.policy,
-                key,
-                config.num_solving_episodes,
-                wanted,
+        def evaluate(state: ActorCriticState, params: Params, key: jax.Array, wanted):
+            episodes = config.num_solving_episodes
+            returns, faulty_share = rollout.evaluate(
+                world.env, params, agent.policy, state.policy, key, episodes, wanted
             )
-            return returns.mean()
+            return returns.mean(), faulty_share
 
         def start(key: jax.Array) -> UntilSolved:
             init_key, key = jax.random.split(key)
@@ -202,34 +197,42 @@ class Experiment:
         function = split.over_seeds(function, axes, self.trainer.mesh)
         return self.trainer.call(function, *arguments, options=options)
 
+    def map_guarded(self, what: str, function, *arguments, axes: Any = 0) -> Any:
+        """As `map`, of a function whose second result is a share of faulty steps, to be told."""
+        result, faulty_share = self.map(function, *arguments, axes=axes)
+        self.trainer.check_faults(what, np.asarray(faulty_share))
+        return result
+
     def target_returns(self, policy: PolicyParams, stage: str) -> np.ndarray:
         """Return the mean return of stochastic policies [seeds] in the target, [seeds]."""
         target, agent = self.worlds.target, self.worlds.agent
 
-        def evaluate(policy: PolicyParams, key: jax.Array) -> jax.Array:
+        def evaluate(policy: PolicyParams, key: jax.Array):
             episodes = self.config.num_episodes
-            returns = rollout.evaluate(
+            returns, faulty_share = rollout.evaluate(
                 target.env, target.params, agent.policy, policy, key, episodes
             )
-            return returns.mean()
+            return returns.mean(), faulty_share
 
-        return np.asarray(self.map(evaluate, policy, _fold(self.keys, f"{stage} evaluation")))
+        what = f"{stage} evaluation"
+        return np.asarray(self.map_guarded(what, evaluate, policy, _fold(self.keys, what)))
 
     def record(self, policy: PolicyParams, name: str) -> Recorded:
         """Roll policies [seeds] out in the target: transitions and states, [seeds, T, B]."""
         target, agent = self.worlds.target, self.worlds.agent
         num_envs = self.config.agent.num_envs
 
-        def collect(policy: PolicyParams, key: jax.Array) -> Recorded:
+        def collect(policy: PolicyParams, key: jax.Array):
             length = self.config.num_target_transitions // num_envs
             recorded = rollout.record(
                 target.env, target.params, agent.policy, policy, key, num_envs, length
             )
-            transitions = recorded.transitions
+            faulty = recorded.transitions.faulty
+            transitions, states = rollout.without_faults(recorded, faulty)
             executed = transitions._replace(action=target.env.clip(transitions.action))
-            return as_of(self.worlds.source, target, recorded._replace(transitions=executed))
+            return as_of(self.worlds.source, target, Recorded(executed, states)), faulty.mean()
 
-        return self.map(collect, policy, _fold(self.keys, name))
+        return self.map_guarded(name, collect, policy, _fold(self.keys, name))
 
     def ground(self, agent_policy: PolicyParams, recorded: Recorded, held_out: Recorded):
         """Learn action transformers [seeds]; return the method and their final states."""
@@ -246,8 +249,9 @@ class Experiment:
             env_params, agent_policy, target, held_out, source_error = params
             state, metrics = method.step(state, env_params, agent_policy, target)
             grounding = Grounding(env_params, state.transformer.policy)
-            error = transition_error(method.grounded, grounding, held_out)
-            return state, metrics | {"error": error, "error_ratio": error / source_error}
+            error, faulty_share = transition_error(method.grounded, grounding, held_out)
+            errors = {"error": error, "error_ratio": error / source_error}
+            return state, metrics | errors | {f"error_{train.FAULTY}": faulty_share}
 
         held_out = thinned(held_out, self.config.num_curve_transitions)
         source_error = self.source_error(held_out)
@@ -260,7 +264,11 @@ class Experiment:
     def source_error(self, held_out: Recorded) -> jax.Array:
         """Return the ungrounded source's transition error, [seeds]."""
         source = self.worlds.source
-        return self.map(lambda data: transition_error(source.env, source.params, data), held_out)
+
+        def error(held_out: Recorded):
+            return transition_error(source.env, source.params, held_out)
+
+        return self.map_guarded("the source's error", error, held_out)
 
 
 def thinned(recorded: Recorded, num_transitions: int) -> Recorded:
@@ -314,7 +322,7 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
         source_state,
         axes,
     )
-    noisy = GroundedEnv(source.env, _action_noise(source.env))
+    noisy = GroundedEnv(source.env, action_noise(source.env))
     more_state, noise_state = (
         experiment.retrain(stage, noisy, Grounding(source.params, jnp.asarray(scale)), source_state)
         for stage, scale in (("more source training", 0.0), ("action noise", config.action_noise))
@@ -357,17 +365,6 @@ def _fold(keys: jax.Array, name: str) -> jax.Array:
     return jax.vmap(lambda key: jax.random.fold_in(key, number))(keys)
 
 
-def _action_noise(env: Env):
-    """Return what adds noise to actions; its parameter is the noise's scale in half-ranges, []."""
-    half_range = (env.action_high - env.action_low) / 2
-
-    def transform(scale: jax.Array, obs: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
-        del obs
-        return action + scale * half_range * jax.random.normal(key, action.shape)
-
-    return transform
-
-
 def _errors(
     experiment: Experiment,
     grounded: Env,
@@ -390,4 +387,7 @@ def _errors(
             "constant_action": constant_error(source.env, source.params, held_out, best),
         }
 
-    return jax.tree.map(np.asarray, experiment.map(errors, transformer, recorded, held_out))
+    found = experiment.map(errors, transformer, recorded, held_out)
+    for name, error in found.items():
+        experiment.trainer.check_faults(f"{name} error", np.asarray(error.faulty_share))
+    return {name: np.asarray(error.mean) for name, error in found.items()}

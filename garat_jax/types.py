@@ -19,7 +19,9 @@ class Transition(NamedTuple):
     """What one control step gave; leading axes are [T, B] in a batch.
 
     `next_obs` is always the observation before any reset. A step that ends an episode because
-    the task says so is `terminated`; one that ends it because time is up is `truncated`.
+    the task says so is `terminated`; one that ends it because time is up is `truncated`. One in
+    which physics left the finite numbers is `terminated` and `faulty`: nothing sound followed, its
+    reward is 0 and its `next_obs` is its `obs`.
     """
 
     obs: jax.Array
@@ -29,6 +31,7 @@ class Transition(NamedTuple):
     terminated: jax.Array
     truncated: jax.Array
     log_prob: jax.Array
+    faulty: jax.Array
 
 
 class Agent(NamedTuple):

@@ -147,3 +147,15 @@ class Walk(Env):
         steps = state.steps + 1
         truncated = (steps >= self.episode_length) & ~terminated
         return StepResult(EnvState(None, obs, steps), obs[0], terminated, truncated)
+
+
+class Bursting(Walk):
+    """A walk in which physics fails beyond 0.5, to infinity or to NaN, before the task ends it."""
+
+    def __init__(self, to: float):
+        self.to = to
+
+    def step(self, params, state, action, key):
+        result = super().step(params, state, action, key)
+        obs = jnp.where(result.state.obs > 0.5, self.to, result.state.obs)
+        return result._replace(state=result.state._replace(obs=obs), reward=obs[0])

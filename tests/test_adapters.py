@@ -16,7 +16,7 @@ from garat_jax.agents import trpo
 from garat_jax.env import EnvState, StepResult, make_world
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.errors import UserError
-from tests.probe_envs import Probe
+from tests.probe_envs import Bursting, Probe, WalkParams
 
 OLD_BRAX = pytest.mark.filterwarnings("ignore:Accessing .* directly from `Data` is deprecated")
 """Brax 0.14.2 reads MJX's data as older versions had it."""
@@ -95,6 +95,26 @@ def test_randomness_differs_between_environments_and_goes_on_after_a_reset(wrapp
     assert len(np.unique(first[:, 0])) == 3
     noise = np.asarray(states.obs[::2, 0, 0] - first[0, 0])  # one step after each reset
     assert len(np.unique(noise)) == 3
+
+
+@pytest.mark.parametrize("to", [jnp.nan, 1e12])
+def test_a_world_that_fails_ends_its_episode_and_brax_counts_it(to):
+    env = to_brax(Bursting(to), WalkParams(0.3))
+    state = env.reset(jax.random.PRNGKey(0))
+    while state.obs[0] <= 0.2:
+        state = env.step(state, jnp.ones(1))
+        assert (state.done, state.metrics["faulty"]) == (0, 0)
+    after = env.step(state, jnp.ones(1))
+    np.testing.assert_array_equal(after.obs, state.obs)
+    assert (after.reward, after.done, after.metrics["faulty"]) == (0, 1, 1)
+
+    wrapped = wrappers.EvalWrapper(wrappers.wrap(env, episode_length=6))
+    state = wrapped.reset(jax.random.split(jax.random.PRNGKey(0), 3))
+    for _ in range(6):
+        state = wrapped.step(state, jnp.ones((3, 1)))
+    metrics = state.info["eval_metrics"]
+    np.testing.assert_array_equal(metrics.episode_metrics["faulty"], [1, 1, 1])
+    assert np.isfinite(metrics.episode_metrics["reward"]).all()
 
 
 def test_brax_randomises_our_parameters():

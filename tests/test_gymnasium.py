@@ -19,7 +19,7 @@ from garat_jax.envs.hopper import Hopper
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.errors import UserError
 from garat_jax.methods.grounded import GroundedEnv, Grounding
-from tests.probe_envs import Walk, WalkParams
+from tests.probe_envs import Bursting, Walk, WalkParams
 
 WALK = (Walk(), WalkParams(0.1))
 
@@ -94,6 +94,19 @@ def test_ends_are_told_apart():
         assert ends[-1] == (terminates, not terminates)
 
 
+@pytest.mark.parametrize("to", [np.nan, 1e12])
+def test_a_world_that_fails_ends_its_episode_says_so_and_shows_the_last_sound_state(to):
+    env = to_gymnasium(Bursting(to), WalkParams(0.3))
+    last = env.reset(seed=0)[0]
+    while last[0] <= 0.2:
+        last, _, terminated, _, info = env.step(np.ones(1))
+        assert (terminated, info) == (False, {})
+    with pytest.warns(RuntimeWarning, match="physics left the finite numbers in 1 step"):
+        obs, reward, terminated, truncated, info = env.step(np.ones(1))
+    np.testing.assert_array_equal(obs, last)
+    assert (reward, terminated, truncated, info) == (0.0, True, False, {"faulty": True})
+
+
 def test_a_seed_fixes_all_that_follows_and_goes_on_without_one():
     def run(env, seeds):
         return [env.reset(seed=seed)[0].copy() for seed in seeds]
@@ -108,19 +121,23 @@ def test_a_seed_fixes_all_that_follows_and_goes_on_without_one():
     np.testing.assert_array_equal(unseeded[2], first[0])
 
 
+@pytest.mark.filterwarnings("ignore:physics left the finite numbers:RuntimeWarning")
+@pytest.mark.parametrize("env", [Walk(), Bursting(np.nan)])
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
-def test_the_vector_does_what_gymnasium_makes_of_single_ones(mode):
+def test_the_vector_does_what_gymnasium_makes_of_single_ones(mode, env):
+    params = WalkParams(0.1, push=0.1)
+
     def single():
-        return to_gymnasium(Walk(), WalkParams(0.1))
+        return to_gymnasium(env, params)
 
     theirs = SyncVectorEnv([single] * 4, autoreset_mode=mode)
-    ours = to_gymnasium_vector(Walk(), WalkParams(0.1), 4, mode == AutoresetMode.SAME_STEP)
+    ours = to_gymnasium_vector(env, params, 4, mode == AutoresetMode.SAME_STEP)
     assert ours.metadata["autoreset_mode"] == mode
     random = np.random.default_rng(0)
     for seed in (3, [5, 9, 9, 2], None):
         obs, expected = ours.reset(seed=seed)[0], theirs.reset(seed=seed)[0]
         np.testing.assert_array_equal(obs, expected)
-        ends = 0
+        ends = faults = 0
         for _ in range(20):
             action = random.uniform(-2.0, 1.0, (4, 1)).astype(np.float32)
             *mine, infos = ours.step(action)
@@ -130,7 +147,14 @@ def test_the_vector_does_what_gymnasium_makes_of_single_ones(mode):
                 assert a.dtype == b.dtype
             assert infos.keys() == other_infos.keys()
             ends += np.sum(mine[2] | mine[3])
-            if infos:
+            for told, expected in (
+                (infos, other_infos),
+                (infos.get("final_info", {}), other_infos.get("final_info", {})),
+            ):
+                assert told.keys() == expected.keys()
+                faults += np.sum(told.get("faulty", False))
+                np.testing.assert_array_equal(told.get("faulty"), expected.get("faulty"))
+            if "final_obs" in infos:
                 done = infos["_final_obs"]
                 np.testing.assert_array_equal(done, other_infos["_final_obs"])
                 for i in range(4):
@@ -138,6 +162,7 @@ def test_the_vector_does_what_gymnasium_makes_of_single_ones(mode):
                         infos["final_obs"][i], other_infos["final_obs"][i]
                     )
         assert ends > 8
+        assert (faults > 0) == isinstance(env, Bursting)
     theirs.close()
 
 

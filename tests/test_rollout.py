@@ -12,7 +12,7 @@ from garat_jax.dynamics import Override
 from garat_jax.engine import HostModel
 from garat_jax.env import make_world
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
-from tests.probe_envs import Walk, WalkParams
+from tests.probe_envs import Bursting, Walk, WalkParams
 
 GAIN = 0.2
 PARAMS = WalkParams(GAIN)
@@ -63,18 +63,6 @@ def test_an_unroll_goes_on_where_the_last_one_stopped():
     np.testing.assert_array_equal(state.steps, [3, 3, 3])
 
 
-class Bursting(Walk):
-    """A walk in which physics fails beyond 0.5, to infinity or to NaN, before the task ends it."""
-
-    def __init__(self, to: float):
-        self.to = to
-
-    def step(self, params, state, action, key):
-        result = super().step(params, state, action, key)
-        obs = jnp.where(result.state.obs > 0.5, self.to, result.state.obs)
-        return result._replace(state=result.state._replace(obs=obs), reward=obs[0])
-
-
 @pytest.mark.parametrize("to", [jnp.inf, jnp.nan, 1e11])
 def test_a_world_that_fails_ends_its_episode_and_is_kept_as_it_was(to):
     env = Bursting(to)
@@ -103,13 +91,70 @@ def test_a_batch_without_failure_has_an_empty_record():
 
 def test_evaluate_counts_only_the_first_episode():
     env, params, key = Walk(), WalkParams(0.5), jax.random.key(4)
-    returns = rollout.evaluate(env, params, constant, jnp.asarray(1.0), key, 5)
+    returns = rollout.evaluate(env, params, constant, jnp.asarray(1.0), key, 5).returns
     start = rollout.reset(env, params, jax.random.split(key)[0], 5).obs[:, 0]
     positions = start[:, None] + params.gain * jnp.arange(1, 7)
     alive = jnp.concatenate([jnp.ones((5, 1)), positions[:, :-1] <= Walk.limit], axis=1)
     expected = (positions * jnp.cumprod(alive, axis=1)).sum(axis=1)
     np.testing.assert_allclose(returns, expected, rtol=1e-5)
     np.testing.assert_array_equal(alive.sum(axis=1), 2)  # of 6 steps, a new episode after them
+
+
+def test_evaluate_pays_nothing_for_a_failure_and_counts_it():
+    key, params = jax.random.key(4), WalkParams(0.2)
+    sound = rollout.evaluate(Walk(), params, constant, jnp.asarray(1.0), key, 5)
+    assert sound.faulty_share == 0
+    found = rollout.evaluate(Bursting(jnp.nan), params, constant, jnp.asarray(1.0), key, 5)
+    start = rollout.reset(Walk(), params, jax.random.split(key)[0], 5).obs[:, 0]
+    positions = start[:, None] + params.gain * jnp.arange(1, 7)
+    np.testing.assert_allclose(found.returns, (positions * (positions <= 0.5)).sum(1), rtol=1e-5)
+    lengths = 1 + (positions <= 0.5).sum(axis=1)
+    assert found.faulty_share == pytest.approx(5 / lengths.sum())
+
+
+def test_an_evaluation_that_is_not_wanted_has_no_failures():
+    env, key = Bursting(jnp.nan), jax.random.key(4)
+    found = rollout.evaluate(env, PARAMS, constant, jnp.ones(()), key, 5, False)
+    np.testing.assert_array_equal(found.returns, np.zeros(5))
+    assert found.faulty_share == 0
+
+
+@pytest.fixture(scope="module")
+def bursting():
+    """Return transitions of walks that fail, [13, 3], as they were recorded."""
+    record = jax.jit(
+        lambda: rollout.record(
+            Bursting(jnp.nan), PARAMS, constant, jnp.ones(()), jax.random.key(0), 3, 13
+        )
+    )
+    return record()
+
+
+def test_recorded_failures_are_marked_and_a_sound_step_can_take_their_place(bursting):
+    transitions = bursting.transitions
+    faulty = np.asarray(transitions.obs + GAIN > 0.5)[..., 0]
+    assert 0 < faulty.mean() < 1
+    np.testing.assert_array_equal(transitions.faulty, faulty)
+    cleaned = rollout.without_faults(bursting, transitions.faulty)
+    found = cleaned.transitions
+    np.testing.assert_allclose(found.next_obs, found.obs + GAIN, rtol=1e-6)
+    assert not found.faulty.any()
+    np.testing.assert_array_equal(cleaned.states.obs, found.obs)
+    for before, after in zip(transitions, found, strict=True):
+        np.testing.assert_array_equal(before[~faulty], after[~faulty])
+
+
+def test_a_failure_before_any_sound_step_gives_way_to_the_first():
+    faulty = jnp.asarray([[True, True], [False, True], [False, False]])
+    found = rollout.without_faults(jnp.arange(6).reshape(3, 2), faulty)
+    np.testing.assert_array_equal(found, [[2, 2], [2, 2], [4, 5]])
+
+
+def test_replay_says_where_a_world_failed(bursting):
+    env = Bursting(jnp.nan)
+    next_obs, faulty = rollout.replay(env, PARAMS, bursting, jax.random.key(0))
+    np.testing.assert_array_equal(faulty, bursting.transitions.faulty.reshape(-1))
+    np.testing.assert_array_equal(next_obs, bursting.transitions.next_obs.reshape(-1, 1))
 
 
 def test_evaluate_steps_no_episode_beyond_its_end(monkeypatch):
@@ -126,7 +171,7 @@ def test_evaluate_steps_no_episode_beyond_its_end(monkeypatch):
     @jax.jit
     @jax.vmap
     def evaluate(key, wanted):
-        return rollout.evaluate(world.env, world.params, uniform, (), key, 6, wanted)
+        return rollout.evaluate(world.env, world.params, uniform, (), key, 6, wanted).returns
 
     @jax.jit
     def unroll(key):
@@ -169,7 +214,7 @@ def test_replay_in_the_same_world_is_exact_and_in_another_is_not(recorded):
     wanted = data.transitions.next_obs.reshape(-1, 4)
     heavy = make_world(InvertedPendulum(), (Override("body", "pole", "mass", 50.0),), (), "mujoco")
     same, other = (
-        jax.jit(partial(rollout.replay, w.env))(w.params, data, jax.random.key(9))
+        jax.jit(partial(rollout.replay, w.env))(w.params, data, jax.random.key(9))[0]
         for w in (world, heavy)
     )
     np.testing.assert_array_equal(same, wanted)

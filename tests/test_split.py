@@ -27,7 +27,7 @@ agent = ppo.make(world.env, ppo.PPOConfig(num_envs=8, num_steps=20, hidden=(8,))
 keys = jax.vmap(jax.random.key)(jnp.arange(num_seeds))
 
 def evaluate(policy, key, wanted):
-    return rollout.evaluate(world.env, world.params, agent.policy, policy, key, 6, wanted)
+    return rollout.evaluate(world.env, world.params, agent.policy, policy, key, 6, wanted).returns
 
 def train(name, mesh):
     run = RunDirectory.create(f"{folder}/{name}", {}, "test", range(num_seeds))

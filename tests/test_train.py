@@ -174,6 +174,17 @@ def test_few_failures_of_physics_are_told_and_many_stop_the_run(tmp_path, capsys
     assert checkpoint.latest_step(loop.run.path("checkpoints/worlds")) == 2
 
 
+def test_failures_outside_of_a_stage_are_told_and_many_stop_the_run(tmp_path, capsys):
+    loop = Trainer(directory(tmp_path / "run"), SEEDS)
+    loop.check_faults("evaluation", np.zeros(2))
+    assert capsys.readouterr().err == ""
+    loop.check_faults("evaluation", np.asarray([0.0, 0.004]))
+    told = " ".join(capsys.readouterr().err.split())
+    assert "evaluation: warning: physics left the finite numbers in 0.4 % of the steps" in told
+    with pytest.raises(DivergedError, match=r"evaluation: seed 8 saw physics leave .* in 2 %"):
+        loop.check_faults("evaluation", np.asarray([0.0, 0.02]))
+
+
 ENGINES = pytest.mark.parametrize("engine", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
 
 
@@ -261,7 +272,7 @@ def climber(solved_return: float):
 
     def evaluate(height, params, key, wanted):
         del params, key
-        return jnp.where(wanted, height, 0.0)
+        return jnp.where(wanted, height, 0.0), 0.0
 
     return jax.vmap(train.until_solved(step, evaluate, solved_return), (0, None))
 

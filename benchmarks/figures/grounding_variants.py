@@ -121,9 +121,10 @@ def baselines(experiment: Experiment, recorded: Recorded, held_out: Recorded) ->
 
     def ratios(recorded: Recorded, held_out: Recorded):
         best = best_constant(source.env, source.params, recorded)
-        zero = constant_error(source.env, source.params, held_out, 0.0)
-        constant = constant_error(source.env, source.params, held_out, best)
-        return jnp.stack([zero, constant]) / transition_error(source.env, source.params, held_out)
+        zero = constant_error(source.env, source.params, held_out, 0.0).mean
+        constant = constant_error(source.env, source.params, held_out, best).mean
+        plain = transition_error(source.env, source.params, held_out).mean
+        return jnp.stack([zero, constant]) / plain
 
     found = np.asarray(experiment.map(ratios, recorded, held_out)).T
     names = ("baseline: zero action", "baseline: the best constant action")

@@ -13,12 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from garat_jax.env import Env, EnvState, StepResult
+from garat_jax.env import Env, EnvState, StepResult, guarded_step
 from garat_jax.errors import UserError
 from garat_jax.types import Params
 
 KEY = "key"
 """Where a Brax state's `info` carries the raw PRNG key of an environment's next step."""
+FAULTY = "faulty"
+"""Where its `metrics` count steps in which physics left the finite numbers."""
 
 
 class BraxEnv(brax.envs.base.Env):
@@ -42,18 +44,20 @@ class BraxEnv(brax.envs.base.Env):
         state = self.env.reset(self.sys, reset_key)
         zero = jnp.zeros((), jnp.float32)
         info = {KEY: jax.random.key_data(key)}
-        return brax.envs.base.State(_any(state), state.obs, zero, zero, {}, info)
+        return brax.envs.base.State(_any(state), state.obs, zero, zero, {FAULTY: zero}, info)
 
     def step(self, state: brax.envs.base.State, action: jax.Array) -> brax.envs.base.State:
-        """Take one control step; `done` says only that the task ended it."""
+        """Take one guarded step; `done` says only that the task, or a fault, ended it."""
         step_key, key = jax.random.split(jax.random.wrap_key_data(state.info[KEY]))
         sent = jnp.asarray(self._middle) + self._half_range * action
-        result = self.env.step(self.sys, _any(state.pipeline_state), sent, step_key)
+        before = _any(state.pipeline_state)
+        result, faulty, _ = guarded_step(self.env, self.sys, before, sent, step_key)
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=result.state,
             obs=result.state.obs,
             reward=result.reward,
             done=result.terminated.astype(jnp.float32),
+            metrics={**state.metrics, FAULTY: faulty.astype(jnp.float32)},
             info={**state.info, KEY: jax.random.key_data(key)},
         )
 
@@ -108,11 +112,11 @@ class BraxSource(Env):
     def step(
         self, params: Params, state: EnvState, action: jax.Array, key: jax.Array
     ) -> StepResult:
-        """Take one control step; an observation that is not finite ends the episode."""
+        """Take one control step."""
         del params, key
         after = self.env.step(_any(state.physics), self.clip(action))
         steps = state.steps + 1
-        terminated = (after.done > 0) | ~jnp.isfinite(after.obs).all()
+        terminated = after.done > 0
         truncated = (steps >= self.episode_length) & ~terminated
         return StepResult(EnvState(after, after.obs, steps), after.reward, terminated, truncated)
 

@@ -4,6 +4,7 @@ What they return are copies: NumPy shows JAX's arrays as they are, and nobody ma
 """
 
 import functools
+import warnings
 from typing import Any
 
 import gymnasium
@@ -14,8 +15,11 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from garat_jax.env import Env, EnvState, StepResult
+from garat_jax.env import Env, EnvState, GuardedStep, StepResult, guarded_step
 from garat_jax.types import Params
+
+FAULTY = "faulty"
+"""Where `info` says that physics left the finite numbers in a step, which ended the episode."""
 
 
 def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -35,6 +39,15 @@ def _start(env: Env, params: Params, key: jax.Array) -> tuple[EnvState, jax.Arra
     return env.reset(params, reset_key), key
 
 
+def _warn_of_faults(count: int) -> None:
+    warnings.warn(
+        f"physics left the finite numbers in {count} step{'s' if count > 1 else ''}, which ended "
+        "with the last sound observation and no reward",
+        RuntimeWarning,
+        stacklevel=3,
+    )
+
+
 class GymnasiumEnv(gymnasium.Env):
     """One of our environments as Gymnasium's; see `to_gymnasium`."""
 
@@ -47,7 +60,7 @@ class GymnasiumEnv(gymnasium.Env):
 
         def step(params: Params, state: EnvState, action: jax.Array, key: jax.Array):
             step_key, key = jax.random.split(key)
-            return env.step(params, state, action, step_key), key
+            return guarded_step(env, params, state, action, step_key), key
 
         self._start = jax.jit(lambda params, key: _start(env, params, key))
         self._step = jax.jit(step)
@@ -63,7 +76,7 @@ class GymnasiumEnv(gymnasium.Env):
         return np.array(self._state.obs, np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Take one control step.
+        """Take one guarded step; `info["faulty"]` is true where physics left the finite numbers.
 
         Raises:
             ResetNeeded: The environment has not been reset yet.
@@ -71,10 +84,13 @@ class GymnasiumEnv(gymnasium.Env):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         action = np.asarray(action, np.float32)
-        result, self._key = self._step(self._params, self._state, action, self._key)
+        (result, faulty, _), self._key = self._step(self._params, self._state, action, self._key)
         self._state = result.state
         obs = np.array(result.state.obs, np.float32)
-        return obs, float(result.reward), bool(result.terminated), bool(result.truncated), {}
+        info = {FAULTY: True} if faulty else {}
+        if faulty:
+            _warn_of_faults(1)
+        return obs, float(result.reward), bool(result.terminated), bool(result.truncated), info
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
@@ -123,7 +139,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Take one control step in each, and reset those whose episode ended: now or before.
+        """Take one guarded step in each, and reset those whose episode ended: now or before.
+
+        Where physics left the finite numbers, `infos["faulty"]` says so, or
+        `infos["final_info"]["faulty"]` where an environment is reset within the step.
 
         Raises:
             ResetNeeded: The environments have not been reset yet.
@@ -131,13 +150,16 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if self._states is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         actions = np.asarray(actions, np.float32)
-        result, self._states, self._keys = self._step(
+        (result, faulty, _), self._states, self._keys = self._step(
             self._params, self._states, actions, self._keys, self._over
         )
+        faulty = np.array(faulty)
+        if faulty.any():
+            _warn_of_faults(faulty.sum())
         terminated, truncated = np.array(result.terminated), np.array(result.truncated)
-        infos = {}
+        infos = {FAULTY: faulty, f"_{FAULTY}": faulty} if faulty.any() else {}
         if self._same_step:
-            infos = _final(np.array(result.state.obs, np.float32), terminated | truncated)
+            infos = _final(np.array(result.state.obs, np.float32), terminated | truncated, infos)
         else:
             self._over = terminated | truncated
         obs = np.array(self._states.obs, np.float32)
@@ -149,30 +171,31 @@ def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
 
 
 def _step_and_reset(env: Env, params: Params, state: EnvState, action, key, over):
-    """Take one control step, and start anew if it ends the episode."""
+    """Take one guarded step, and start anew if it ends the episode."""
     del over
     step_key, key = jax.random.split(key)
-    result = env.step(params, state, action, step_key)
+    step = guarded_step(env, params, state, action, step_key)
+    result = step.result
     done = result.terminated | result.truncated
     state, key = _select(done, _start(env, params, key), (result.state, key))
-    return result, state, key
+    return step, state, key
 
 
 def _reset_or_step(env: Env, params: Params, state: EnvState, action, key, over):
-    """Start anew if the episode is over already; otherwise take one control step."""
+    """Start anew if the episode is over already; otherwise take one guarded step."""
     step_key, next_key = jax.random.split(key)
-    result = env.step(params, state, action, step_key)
+    step = guarded_step(env, params, state, action, step_key)
     fresh = _start(env, params, key)
-    nothing = StepResult(fresh[0], *jax.tree.map(jnp.zeros_like, tuple(result[1:])))
-    result = _select(over, nothing, result)
-    return result, result.state, _select(over, fresh[1], next_key)
+    nothing = StepResult(fresh[0], *jax.tree.map(jnp.zeros_like, tuple(step.result[1:])))
+    step = _select(over, GuardedStep(nothing, jnp.zeros((), bool), fresh[0]), step)
+    return step, step.result.state, _select(over, fresh[1], next_key)
 
 
-def _final(obs: np.ndarray, done: np.ndarray) -> dict[str, Any]:
-    """Return the infos that tell of ended episodes; empty where none ended."""
+def _final(obs: np.ndarray, done: np.ndarray, infos: dict[str, Any]) -> dict[str, Any]:
+    """Return the infos that tell of ended episodes, and theirs; empty where none ended."""
     if not done.any():
         return {}
     final_obs = np.full(len(done), None, dtype=object)
     for i in np.flatnonzero(done):
         final_obs[i] = obs[i]
-    return {"final_obs": final_obs, "_final_obs": done, "final_info": {}, "_final_info": done}
+    return {"final_obs": final_obs, "_final_obs": done, "final_info": infos, "_final_info": done}

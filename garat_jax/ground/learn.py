@@ -31,7 +31,7 @@ from garat_jax.methods.recorded import (
 )
 from garat_jax.methods.transition_error import transition_error
 from garat_jax.runs import RunDirectory
-from garat_jax.train import Trainer
+from garat_jax.train import FAULTY, Trainer
 from garat_jax.transfer import GroundConfig, make_method
 from garat_jax.types import Params, Policy
 
@@ -188,8 +188,9 @@ def _learn(lesson: Lesson, config: GroundConfig, reach: float, trainer: Trainer)
         world, agent_params, target, recorded = params
         state, metrics = method.step(state, world, agent_params, target)
         grounding = Grounding(world, state.transformer.policy)
-        error = transition_error(GroundedEnv(quiet, method.transform), grounding, recorded)
-        return state, metrics | {"error": error, "error_ratio": error / errors["source"]}
+        error, faulty = transition_error(GroundedEnv(quiet, method.transform), grounding, recorded)
+        told = {"error": error, "error_ratio": error / errors["source"], f"error_{FAULTY}": faulty}
+        return state, metrics | told
 
     params = (world, agent_params, target, recorded)
     step = jax.vmap(update, (0, None))
@@ -213,4 +214,6 @@ def _errors(env: RecordedEnv, world: Dynamics, recorded, trainer: Trainer, optio
         }
 
     found = trainer.call(both, world, recorded, options=options)
-    return {name: float(error) for name, error in found.items()}
+    for name, error in found.items():
+        trainer.check_faults(f"{name} error", np.asarray(error.faulty_share)[None])
+    return {name: float(error.mean) for name, error in found.items()}

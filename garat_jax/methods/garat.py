@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from garat_jax import rollout
 from garat_jax.agents import ppo
 from garat_jax.agents.actor_critic import ActorCriticState, PolicyParams
 from garat_jax.agents.ppo import PPOConfig
@@ -152,6 +153,7 @@ class GARAT:
         """
         params = TransformerParams(env_params, agent, state.reward)
         transformer, metrics, transitions = self.transformer.step(state.transformer, params)
+        transitions = rollout.without_faults(transitions, transitions.faulty)
         obs, action = self.env.split(transitions.obs)
         next_obs, _ = self.env.split(transitions.next_obs)
         grounded = features(state.reward.normaliser, obs, action, next_obs)

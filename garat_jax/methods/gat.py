@@ -65,10 +65,19 @@ class Transformer(NamedTuple):
 
 
 class GATState(NamedTuple):
-    """The models while they are learned, and the source's transitions [M]."""
+    """The models while they are learned.
+
+    Attributes:
+        transformer: Both models.
+        source: The source's transitions, [M].
+        faulty_share: Share of the source's steps that were faulty, [], until it has been told.
+        optimiser: Of both models.
+        key: PRNG key.
+    """
 
     transformer: Transformer
     source: Transition
+    faulty_share: jax.Array
     optimiser: optax.OptState
     key: jax.Array
 
@@ -113,7 +122,9 @@ class GAT:
         recorded = rollout.record(
             self.env, env_params, self.agent, agent, rollout_key, config.num_envs, config.num_steps
         )
-        source = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), recorded.transitions)
+        faulty = recorded.transitions.faulty
+        source = rollout.without_faults(recorded.transitions, faulty)
+        source = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), source)
         source = source._replace(action=self.env.clip(source.action))
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), source, target)
         obs, change, action = (_scale(x) for x in (both.obs, both.next_obs - both.obs, both.action))
@@ -126,7 +137,7 @@ class GAT:
         )
         steps = jnp.asarray(source.reward.size, jnp.int32)
         optimiser = self.optimiser.init((models.forward, models.inverse))
-        return GATState(Transformer(models, steps), source, optimiser, key)
+        return GATState(Transformer(models, steps), source, faulty.mean(), optimiser, key)
 
     def step(
         self, state: GATState, env_params: Params, agent: Params, target: Transition
@@ -146,7 +157,9 @@ class GAT:
         (models, optimiser), losses = jax.lax.scan(epoch, carry, keys)
         transformer = state.transformer._replace(policy=models)
         metrics = {name: loss[-1].mean() for name, loss in losses.items()}
-        return GATState(transformer, state.source, optimiser, key), metrics
+        metrics["source_faulty_share"] = state.faulty_share
+        told = jnp.zeros_like(state.faulty_share)
+        return GATState(transformer, state.source, told, optimiser, key), metrics
 
     def _minibatches(self, data: Transition, key: jax.Array) -> Transition:
         """Return one pass over the larger of both data sets, [num, minibatch] of this one."""

@@ -147,3 +147,14 @@ def decode_action(
         return env.clip(origin + reach * half_range * jnp.clip(output, -1, 1))
 
     return decode
+
+
+def action_noise(env: Env) -> Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]:
+    """Return what adds noise to actions; its parameter is the noise's scale in half-ranges, []."""
+    half_range = (env.action_high - env.action_low) / 2
+
+    def transform(scale: jax.Array, obs: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
+        del obs
+        return action + scale * half_range * jax.random.normal(key, action.shape)
+
+    return transform

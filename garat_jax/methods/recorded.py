@@ -186,7 +186,7 @@ def as_transitions(env: Env, steps: Steps) -> Transition:
     num = len(steps.state)
     state, action, next_state = (jnp.asarray(x, jnp.float32) for x in steps)
     never, nothing = jnp.zeros(num, bool), jnp.zeros(num)
-    return Transition(state, env.clip(action), nothing, next_state, never, never, nothing)
+    return Transition(state, env.clip(action), nothing, next_state, never, never, nothing, never)
 
 
 def as_recorded(env: RecordedEnv, params: Dynamics, steps: Steps) -> Recorded:

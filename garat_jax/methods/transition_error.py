@@ -1,5 +1,7 @@
 """How far a source is from the target, one step at a time: no policy, no learning in it."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
@@ -12,18 +14,32 @@ CONSTANT_ACTIONS = 21
 """Constant actions that the constant baseline tries, over the action's range."""
 
 
-def transition_error(env: Env, params: Params, recorded: Recorded) -> jax.Array:
-    """Return the mean L2 error of next observations, each step from the recorded state, []."""
+class TransitionError(NamedTuple):
+    """How far off single steps are.
+
+    Attributes:
+        mean: L2 error of the next observations of all sound steps, []; NaN if there are none.
+        faulty_share: Share of the steps in which physics left the finite numbers, [].
+    """
+
+    mean: jax.Array
+    faulty_share: jax.Array
+
+
+def transition_error(env: Env, params: Params, recorded: Recorded) -> TransitionError:
+    """Return the error of next observations, each step from the recorded state."""
     # No environment that this is called with draws anything.
-    next_obs = rollout.replay(env, params, recorded, jax.random.key(0))
+    next_obs, faulty = rollout.replay(env, params, recorded, jax.random.key(0))
     wanted = recorded.transitions.next_obs.reshape(next_obs.shape)
-    return jnp.mean(jnp.linalg.norm(next_obs - wanted, axis=-1))
+    sound = ~(faulty | recorded.transitions.faulty.reshape(-1))
+    distance = jnp.linalg.norm(next_obs - wanted, axis=-1)
+    return TransitionError(jnp.sum(distance * sound) / sound.sum(), faulty.mean())
 
 
 def constant_error(
     env: Env, params: Params, recorded: Recorded, action: jax.Array | float
-) -> jax.Array:
-    """Return the transition error [] with the same action [action_size] in every step."""
+) -> TransitionError:
+    """Return the transition error with the same action [action_size] in every step."""
     transitions = recorded.transitions
     fixed = transitions._replace(action=jnp.broadcast_to(action, transitions.action.shape))
     return transition_error(env, params, recorded._replace(transitions=fixed))
@@ -33,5 +49,5 @@ def best_constant(env: Env, params: Params, recorded: Recorded) -> jax.Array:
     """Return the action [action_size], one of `CONSTANT_ACTIONS`, of least transition error."""
     fractions = jnp.linspace(0.0, 1.0, CONSTANT_ACTIONS)
     actions = env.action_low + fractions[:, None] * (env.action_high - env.action_low)
-    errors = jax.lax.map(lambda action: constant_error(env, params, recorded, action), actions)
-    return actions[jnp.argmin(errors)]
+    errors = jax.lax.map(lambda action: constant_error(env, params, recorded, action).mean, actions)
+    return actions[jnp.nanargmin(errors)]

@@ -26,6 +26,7 @@ def transitions(reward, terminated=(), truncated=()) -> Transition:
         terminated=jnp.asarray(np.isin(steps, terminated))[:, None],
         truncated=jnp.asarray(np.isin(steps, truncated))[:, None],
         log_prob=empty[..., 0],
+        faulty=jnp.zeros((len(reward), 1), bool),
     )
 
 

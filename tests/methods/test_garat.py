@@ -20,7 +20,7 @@ from garat_jax.methods.garat import (
 )
 from garat_jax.methods.grounded import Grounding, TransformerParams
 from garat_jax.methods.transition_error import transition_error
-from tests.probe_envs import Walk, WalkParams
+from tests.probe_envs import Bursting, Walk, WalkParams
 
 ENV = Walk()
 SOURCE, TARGET, FAR = (WalkParams(0.2, push) for push in (0.0, -0.1, -0.5))
@@ -164,10 +164,10 @@ def test_a_short_run_grounds_a_source_in_a_target_that_pushes():
     def step(state, _):
         state, _ = garat.step(state, SOURCE, (), batch)
         grounding = Grounding(SOURCE, state.transformer.policy)
-        return state, transition_error(garat.grounded, grounding, held_out)
+        return state, transition_error(garat.grounded, grounding, held_out).mean
 
     state, errors = jax.jit(lambda s: jax.lax.scan(step, s, length=80))(state)
-    assert transition_error(ENV, SOURCE, held_out) == pytest.approx(0.1, rel=1e-4)
+    assert transition_error(ENV, SOURCE, held_out).mean == pytest.approx(0.1, rel=1e-4)
     assert errors[-20:].mean() < 0.05
     # The paper's reward, -log D as it is, is never negative.
     assert state.reward.offset == 0
@@ -180,3 +180,20 @@ def test_the_papers_settings_are_the_defaults_of_ppo():
     assert (config.num_minibatches, config.num_epochs) == (2, 1)
     assert (config.trace, config.discount) == (0.95, 0.99)
     assert (config.clip, config.learning_rate) == (0.1, 3e-4)
+
+
+def test_the_discriminator_never_sees_a_step_in_which_physics_failed(monkeypatch):
+    """The features of such a step would have an unchanged observation."""
+    target, source = flat(record(TARGET, 1).transitions), WalkParams(0.5)
+    garat = GARAT(Bursting(jnp.nan), agent, SMALL)
+    state = garat.init(jax.random.key(0), source, (), target)
+    seen, update = [], garat._update_discriminator
+
+    def spied(reward, optimiser, grounded, *rest):
+        seen.append(grounded[:, 2] * reward.normaliser.std[2] + reward.normaliser.mean[2])
+        return update(reward, optimiser, grounded, *rest)
+
+    monkeypatch.setattr(garat, "_update_discriminator", spied)
+    _, metrics = garat.step(state, source, (), target)
+    assert metrics["transformer_faulty_share"] > 0
+    assert np.abs(seen[0]).min() > 1e-5

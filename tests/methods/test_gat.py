@@ -11,7 +11,7 @@ from garat_jax import rollout
 from garat_jax.methods.gat import GAT, GATConfig
 from garat_jax.methods.grounded import Grounding
 from garat_jax.methods.transition_error import transition_error
-from tests.probe_envs import Walk, WalkParams
+from tests.probe_envs import Bursting, Walk, WalkParams
 
 ENV = Walk()
 SOURCE, TARGET = WalkParams(0.2, 0.0), WalkParams(0.1, -0.05)
@@ -42,7 +42,7 @@ def learned():
 
 def test_both_models_learn(learned):
     _, _, metrics = learned
-    for loss in metrics.values():
+    for loss in (metrics["forward_loss"], metrics["inverse_loss"]):
         assert loss[-1] < 0.01
         assert loss[-1] < loss[0]
 
@@ -56,11 +56,28 @@ def test_an_action_becomes_the_one_that_does_the_same_in_the_source(learned, act
     assert sent == pytest.approx(wanted, abs=0.1)
 
 
+def test_it_learns_nothing_from_steps_in_which_physics_failed_and_tells_of_them():
+    target = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), record(TARGET, 1).transitions)
+    source = WalkParams(0.5)
+    gat = GAT(Bursting(jnp.nan), agent, CONFIG)
+    state = gat.init(jax.random.key(0), source, (), target)
+    assert not state.source.faulty.any()
+    change = state.source.next_obs - state.source.obs
+    np.testing.assert_allclose(change, source.gain * state.source.action, atol=1e-6)
+    shares = []
+    for _ in range(2):
+        state, metrics = gat.step(state, source, (), target)
+        shares.append(float(metrics["source_faulty_share"]))
+    assert shares[0] > 0
+    assert shares[1] == 0
+
+
 def test_it_grounds_the_source(learned):
     gat, state, _ = learned
     held_out = record(TARGET, 2)
-    before = transition_error(ENV, SOURCE, held_out)
-    after = transition_error(gat.grounded, Grounding(SOURCE, state.transformer.policy), held_out)
+    before = transition_error(ENV, SOURCE, held_out).mean
+    grounding = Grounding(SOURCE, state.transformer.policy)
+    after = transition_error(gat.grounded, grounding, held_out).mean
     assert after < 0.1 * before
 
 

@@ -19,7 +19,7 @@ from garat_jax.methods.transition_error import (
     constant_error,
     transition_error,
 )
-from tests.probe_envs import Walk, WalkParams
+from tests.probe_envs import Bursting, Walk, WalkParams
 
 ENV = Walk()  # actions from -2 to 1: middle -0.5, half-range 1.5
 GAIN = 0.2
@@ -121,8 +121,8 @@ def test_unbounded_actions_are_refused():
 def test_transition_error_is_the_mean_distance():
     recorded = rollout.record(ENV, PARAMS, uniform, 0.0, jax.random.key(5), 4, 7)
     size = np.abs(ENV.clip(recorded.transitions.action)).mean()
-    assert transition_error(ENV, PARAMS, recorded) < 1e-7
-    assert transition_error(ENV, WalkParams(GAIN / 2), recorded) == pytest.approx(
+    assert transition_error(ENV, PARAMS, recorded).mean < 1e-7
+    assert transition_error(ENV, WalkParams(GAIN / 2), recorded).mean == pytest.approx(
         0.1 * size, rel=1e-5
     )
 
@@ -137,8 +137,8 @@ def record_constant(action: float) -> rollout.Recorded:
 
 def test_the_error_of_a_constant_action_is_what_it_moves_otherwise():
     recorded = record_constant(0.0)
-    assert constant_error(ENV, PARAMS, recorded, 0.0) == pytest.approx(0.0, abs=1e-6)
-    assert constant_error(ENV, PARAMS, recorded, -1.5) == pytest.approx(0.3, rel=1e-5)
+    assert constant_error(ENV, PARAMS, recorded, 0.0).mean == pytest.approx(0.0, abs=1e-6)
+    assert constant_error(ENV, PARAMS, recorded, -1.5).mean == pytest.approx(0.3, rel=1e-5)
 
 
 @pytest.mark.parametrize("number", [0, 7, CONSTANT_ACTIONS - 1])
@@ -146,3 +146,12 @@ def test_the_best_constant_action_is_sought_over_the_whole_range(number):
     action = np.linspace(-2, 1, CONSTANT_ACTIONS)[number]
     recorded = record_constant(float(action))
     assert best_constant(ENV, PARAMS, recorded) == pytest.approx(action)
+
+
+def test_the_error_is_that_of_the_sound_steps_and_says_how_many_were_not():
+    recorded = record_constant(1.0)
+    error = transition_error(Bursting(jnp.nan), WalkParams(GAIN / 2), recorded)
+    failed = np.asarray(recorded.transitions.obs + GAIN / 2 > 0.5)
+    assert 0 < failed.mean() < 1
+    assert error.faulty_share == pytest.approx(failed.mean())
+    assert error.mean == pytest.approx(GAIN / 2, rel=1e-5)
