@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import tomllib
 import types
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.maps import read_map
+from garat_jax.effects.catalogue import ENTRY_POINTS
 from tests import models
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -62,18 +64,43 @@ def test_the_page_on_your_own_robot_runs(tmp_path, monkeypatch, capsys):
     assert "(8, 4)" in capsys.readouterr().out
 
 
-def test_the_diagnosis_pages_python_runs(tmp_path, monkeypatch, capsys):
-    page = (REPOSITORY / "docs" / "diagnosis.md").read_text(encoding="utf-8")
-    (snippet,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    model = tmp_path / "pendulum.xml"
-    model.write_text(models.PENDULUM)
-    made = make_recordings(
-        model, tmp_path / "data", 5, num_recordings=3, seconds=3.0, rate=125.0,
-        kind="coulomb_friction",
-    )  # fmt: skip
+def test_the_page_on_python_runs(tmp_path, monkeypatch, capsys):
+    page = (REPOSITORY / "docs" / "python.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    exec(snippet, {"paths": (*made.fit, *made.holdout)})
-    assert "Missing: coulomb_friction at joint/hinge" in capsys.readouterr().out
+    Path("pendulum.xml").write_text(models.PENDULUM)
+    for name, seed in (("recordings", 5), ("recordings/warm", 6)):
+        made = make_recordings(
+            Path("pendulum.xml"), Path("made", str(seed)), seed, num_recordings=3, seconds=3.0,
+            rate=125.0, kind="coulomb_friction",
+        )  # fmt: skip
+        Path(name).mkdir()
+        for path in (*made.fit, *made.holdout):
+            path.rename(Path(name, path.name))
+    names: dict = {}
+    for snippet in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(snippet, names)
+    printed = capsys.readouterr().out
+    for said in (
+        "times what noise alone would make",
+        "Missing: coulomb_friction at joint/hinge",
+        "coulomb_friction at joint/hinge torque 0.0",  # the estimates, one by one
+        "coulomb_friction at joint/hinge:\ntorque = 0.0",
+        "+ coulomb_friction at joint/hinge (torque 0.0",
+        "Under the condition warm, with the above: Missing: coulomb_friction",
+        "['coulomb_friction at joint/hinge']",
+        "and coulomb_friction at joint/hinge: cosine",
+        "report.html",
+    ):
+        assert said in printed
+    assert Path("repaired.toml").exists() and Path("excitation.csv").exists()
+
+
+def test_the_page_on_own_effects_shows_the_example():
+    page = (REPOSITORY / "docs" / "own_effects.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert shown == (REPOSITORY / "examples" / "my_effects.py").read_text(encoding="utf-8")
+    (group,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert list(tomllib.loads(group)["project"]["entry-points"]) == [ENTRY_POINTS]
 
 
 def test_the_diagnosis_pages_map_is_read(tmp_path):

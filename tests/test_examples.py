@@ -53,6 +53,24 @@ def test_sweep(capsys):
     assert "KL at most 0.01: " in capsys.readouterr().out
 
 
+def test_conditions(capsys):
+    names = run("06_conditions.py")
+    found, truth = names["diagnosis"], names["truth"]
+    for condition, (friction,) in (("cold", found.selected), ("warm", found.under("warm"))):
+        assert friction.effect == "coulomb_friction"
+        assert friction.parameters["torque"].estimate == pytest.approx(truth[condition], rel=0.05)
+    assert "(instead of the shared one)" in capsys.readouterr().out
+
+
+def test_plan(capsys):
+    names = run("07_plan.py")
+    planned = names["planned"]
+    assert planned.after < planned.before
+    assert len(names["figure"].data) == 1
+    assert planned._repr_html_().startswith("<pre>viscous_damping at joint/hinge and coulomb")
+    assert "300 commands at 100 Hz, time,ctrl." in capsys.readouterr().out
+
+
 def test_an_own_effect_takes_under_30_lines():
     text = (EXAMPLES / "my_effects.py").read_text(encoding="utf-8")
     assert sum(bool(line.strip()) for line in text.splitlines()) < 30

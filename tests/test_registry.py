@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import garat_jax
 from garat_jax import cli, dynamics
 from garat_jax.effects import CATALOGUE
 from garat_jax.env import make_world
@@ -55,6 +56,12 @@ def observations(world, num_steps=25):
         return jax.lax.scan(step, start, jax.random.split(key, num_steps))[1]
 
     return np.asarray(jax.jit(run)(jax.random.key(0)))
+
+
+def test_every_public_name_is_there():
+    for name in garat_jax.__all__:
+        assert getattr(garat_jax, name) is not None, name
+        assert name in dir(garat_jax)
 
 
 @pytest.mark.parametrize(("name", "engine"), NAMES_AND_ENGINES)

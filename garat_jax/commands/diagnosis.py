@@ -233,16 +233,12 @@ class Plan:
         if not 2.0 <= self.seconds <= 600.0:
             raise UserError(f"--seconds {self.seconds:g}: expected 2 to 600")
         from garat_jax.diagnosis import load_model
-        from garat_jax.diagnosis.plan import parse_place, plan, write_plan
+        from garat_jax.diagnosis.plan import plan, write_plan
         from garat_jax.diagnosis.progress import tell
         from garat_jax.effects.catalogue import load_catalogue
 
         model = load_model(self.model, load_catalogue(self.effects))
-        first, second = (parse_place(text, model) for text in self.separate)
-        planned = plan(model, first, second, self.seconds, self.seed, tell)
-        write_plan(planned, model, self.out)
-        say(
-            f"{first} and {second}: cosine {planned.before:.3f} under a plain sine, "
-            f"{planned.after:.3f} under {planned.family} (1: no recording can tell them apart)"
-        )
+        planned = plan(model, *self.separate, self.seconds, self.seed, tell)
+        write_plan(planned, self.out)
+        say(str(planned))
         say(f"excitation: {self.out}")

@@ -45,23 +45,18 @@ class Add:
         values = dict(_assignment(text) for text in self.set)
         check_out(self.out, ".toml", self.force)
         from garat_jax.diagnosis import load_model
-        from garat_jax.diagnosis.add import choose_effect, size
+        from garat_jax.diagnosis.add import add
         from garat_jax.diagnosis.compare import read_recordings
         from garat_jax.diagnosis.model_card import mjcf_in_card, save_card
         from garat_jax.diagnosis.progress import tell
         from garat_jax.effects.catalogue import load_catalogue
 
         model = load_model(self.model, load_catalogue(self.effects))
-        effect = choose_effect(model, self.effect, self.at, values)
-        if not values and not self.fit:
-            raise UserError("an effect needs a size: give --set NAME=VALUE, or --fit DATA")
         mjcf_in_card(self.out, model)
-        if self.fit:
-            recordings = read_recordings(model, self.fit, self.map)
-            sized = size(model, effect, list(values), recordings, tell)
-            say(str(sized))
-            effect = sized.effect
-        save_card(self.out, model, [effect])
+        recordings = read_recordings(model, self.fit, self.map)
+        done = add(model, self.effect, self.at, values, recordings, tell)
+        say(str(done))
+        save_card(self.out, done.model)
         say(f"model card: {self.out}")
 
 

@@ -1,6 +1,7 @@
 """Give a model one more effect, of a size that the user sets or that recordings tell."""
 
 import dataclasses
+import html
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -51,6 +52,59 @@ class Sized(NamedTuple):
             f"error over {self.horizon:g} s on these recordings, of the signals' spread: "
             f"{self.error_before:.3g} → {self.error_after:.3g}"
         )
+
+
+class Added(NamedTuple):
+    """A model with one more effect.
+
+    Attributes:
+        model: The model with the effect.
+        sized: How the recordings sized it; None without recordings.
+    """
+
+    model: Model
+    sized: Sized | None
+
+    def __str__(self) -> str:
+        effect = self.model.effects[-1]
+        return str(self.sized) if self.sized else f"{effect.kind} at {effect.target}, as set"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return f"<pre>{html.escape(str(self))}</pre>"
+
+
+def add(
+    model: Model,
+    kind: str,
+    target: str,
+    values: Mapping[str, float] | None = None,
+    recordings: Sequence[Recording] = (),
+    say: Callable[[str], None] = lambda message: None,
+) -> Added:
+    """Give a model one more effect.
+
+    Args:
+        model: The model; it stays as it is.
+        kind: The effect, by its name in the model's catalogue.
+        target: Where it acts.
+        values: Parameters that are set.
+        recordings: What the other parameters are fitted to; without any, they have no effect.
+        say: Told what is being done.
+
+    Raises:
+        UserError: The effect, the place or a value cannot be, or nothing tells a size.
+    """
+    values = values or {}
+    effect = choose_effect(model, kind, target, values)
+    if not values and not recordings:
+        raise UserError(
+            "an effect needs a size: give --set NAME=VALUE, or --fit DATA (in Python: values, or "
+            "recordings)"
+        )
+    sized = size(model, effect, list(values), recordings, say) if recordings else None
+    effect = sized.effect if sized else effect
+    return Added(dataclasses.replace(model, effects=(*model.effects, effect)), sized)
 
 
 def said(estimate: Estimate) -> str:

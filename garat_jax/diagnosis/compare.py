@@ -31,7 +31,6 @@ from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.torque import TorqueError, compare_torques
 from garat_jax.dynamics import native_model
-from garat_jax.effects import CATALOGUE
 from garat_jax.effects.base import element_names
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.errors import UserError
@@ -209,7 +208,7 @@ def run_compare(
     data: Sequence[Path],
     run: RunDirectory,
     columns: Path | None = None,
-    catalogue: Catalogue = CATALOGUE,
+    catalogue: Catalogue | None = None,
     also: Sequence[Model] = (),
 ) -> Comparison:
     """Compare a model file with recordings; write compare.json and report.html into a run.

@@ -28,7 +28,6 @@ from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.view import repaired
-from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.report import Reproduce, Section, Table
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
@@ -199,7 +198,7 @@ def run_improve(
     holdout: Sequence[Path],
     run: RunDirectory,
     columns: Path | None = None,
-    catalogue: Catalogue = CATALOGUE,
+    catalogue: Catalogue | None = None,
     conditions: Mapping[str, Sequence[Path]] | None = None,
 ) -> Improvement:
     """Repair a model file with recordings; write model.toml, improve.json and report.html.

@@ -17,7 +17,7 @@ import numpy as np
 
 from garat_jax.dynamics import Dynamics, Override, compile
 from garat_jax.effects import CATALOGUE, Effect
-from garat_jax.effects.catalogue import Catalogue
+from garat_jax.effects.catalogue import Catalogue, load_catalogue
 from garat_jax.errors import UserError, choose, unknown_name
 from garat_jax.overrides import load_spec
 
@@ -58,17 +58,19 @@ class Model:
         return compile(self.spec, self.overrides, (*self.effects, *extra_effects), engine)
 
 
-def load_model(path: str | Path, catalogue: Catalogue = CATALOGUE) -> Model:
+def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
     """Read an MJCF file (.xml) or a model card (.toml).
 
     Args:
         path: The file.
-        catalogue: The kinds of effect that there are; `load_catalogue` adds a user's own.
+        catalogue: The kinds of effect that there are: by default the built-in ones and those behind
+            entry points; `load_catalogue` adds a user's own.
 
     Raises:
         UserError: The file cannot be read, or the card names something that does not exist.
     """
     path = Path(path)
+    catalogue = load_catalogue() if catalogue is None else catalogue
     if path.suffix.lower() == ".xml":
         return Model(path.stem, path, path, load_spec(path), catalogue=catalogue)
     if path.suffix.lower() != ".toml":

@@ -6,12 +6,14 @@ trains and chirps are tried, and the best one is varied; the angle decides, and 
 effects show. One under which a joint of the model leaves its range is made smaller until none does.
 """
 
+import html
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
+import plotly.graph_objects as go
 
 from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.measurements import Recording
@@ -22,6 +24,7 @@ from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
 from garat_jax.effects.base import DOFS_OF_JOINT, element_names
 from garat_jax.errors import UserError, choose, unknown_name
+from garat_jax.report import styled
 
 RATE = 100.0
 """Commands a second."""
@@ -58,6 +61,8 @@ class Planned(NamedTuple):
         family: What it is, in words.
         before: Cosine of the two effects under a plain sine, 0 to 1.
         after: The same under this excitation.
+        places: The two effects.
+        actuators: The actuators' names, [nu].
     """
 
     time: np.ndarray
@@ -65,6 +70,27 @@ class Planned(NamedTuple):
     family: str
     before: float
     after: float
+    places: tuple[Place, Place]
+    actuators: tuple[str, ...]
+
+    def __str__(self) -> str:
+        first, second = self.places
+        return (
+            f"{first} and {second}: cosine {self.before:.3f} under a plain sine, "
+            f"{self.after:.3f} under {self.family} (1: no recording can tell them apart)"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        return f"<pre>{html.escape(str(self))}</pre>"
+
+    def plot(self) -> go.Figure:
+        """Draw the commands."""
+        figure = go.Figure()
+        for name, ctrl in zip(self.actuators, self.ctrl.T, strict=True):
+            figure.add_scatter(x=self.time, y=ctrl, name=name, line={"shape": "hv"})
+        figure = styled(figure, height=320).update_xaxes(title_text="time [s]")
+        return figure.update_yaxes(title_text="command")
 
 
 def parse_place(text: str, model: Model) -> Place:
@@ -86,8 +112,8 @@ def parse_place(text: str, model: Model) -> Place:
 
 def plan(
     model: Model,
-    first: Place,
-    second: Place,
+    first: Place | str,
+    second: Place | str,
     seconds: float,
     seed: int = 0,
     say: Callable[[str], None] = lambda message: None,
@@ -96,22 +122,24 @@ def plan(
 
     Args:
         model: The model.
-        first: One effect.
+        first: One effect, or its name as `parse_place` reads it.
         second: The other.
         seconds: Length of the excitation.
         seed: Draws the excitations.
         say: Told what is being done.
 
     Raises:
-        UserError: The model has no actuators or one without limits, the effects are the same, or
-            one shows in nothing.
+        UserError: The model has no actuators or one without limits, an effect is unknown, they are
+            the same, or one shows in nothing.
     """
+    first, second = (parse_place(p, model) if isinstance(p, str) else p for p in (first, second))
+    places = (first, second)
     host = native_model(model.compile(engine="mujoco"))
     limits = _limits(model, host)
     if first == second:
         raise UserError(f"{first} and {second} are the same; name two effects")
     time = np.arange(round(seconds * RATE)) / RATE
-    judge = _Judge(model, (first, second), time, limits)
+    judge = _Judge(model, places, time, limits)
     rng = np.random.default_rng(seed)
     sine = np.sin(2 * np.pi * 0.5 * time)[:, None] * np.ones(host.nu)
     before, plain = judge(sine, 0.3, 0.0)
@@ -133,14 +161,14 @@ def plan(
             f"no excitation was found under which both {first} and {second} show "
             "and all joints stay within their ranges"
         )
-    return Planned(time, best[1], best[2], min(before, 1.0), best[0])
+    names = tuple(element_names(host, "actuator"))
+    return Planned(time, best[1], best[2], min(before, 1.0), best[0], places, names)
 
 
-def write_plan(planned: Planned, model: Model, path: Path) -> Path:
+def write_plan(planned: Planned, path: str | Path) -> Path:
     """Write an excitation as CSV: time and a column `ctrl.ACTUATOR` each."""
-    names = element_names(model.compile(engine="mujoco").host.model, "actuator")
-    columns = {f"ctrl.{name}": planned.ctrl[:, i] for i, name in enumerate(names)}
-    return write_csv(path, {"time": planned.time, **columns})
+    columns = {f"ctrl.{name}": planned.ctrl[:, i] for i, name in enumerate(planned.actuators)}
+    return write_csv(Path(path), {"time": planned.time, **columns})
 
 
 def _draw(number: int, time: np.ndarray, num: int, rng: np.random.Generator):

@@ -16,7 +16,6 @@ from garat_jax.diagnosis.repeat import repeatability
 from garat_jax.diagnosis.report import diagnosis_sections, write_diagnosis
 from garat_jax.diagnosis.report_conditions import condition_sections
 from garat_jax.diagnosis.results import Diagnosis
-from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.report import Section
 from garat_jax.runs import RunDirectory
@@ -35,7 +34,7 @@ def run_diagnose(
     holdout: Sequence[Path],
     run: RunDirectory,
     columns: Path | None = None,
-    catalogue: Catalogue = CATALOGUE,
+    catalogue: Catalogue | None = None,
     conditions: Mapping[str, Sequence[Path]] | None = None,
 ) -> Diagnosed:
     """Diagnose a model file with recordings; write diagnosis.json and report.html into a run.

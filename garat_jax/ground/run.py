@@ -14,7 +14,6 @@ from garat_jax.diagnosis.export import copy_model
 from garat_jax.diagnosis.model_card import Model, load_model, save_card
 from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.report_data import side_by_side_section
-from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue, run_python
 from garat_jax.errors import UserError
 from garat_jax.ground.learn import Grounded, ground
@@ -36,7 +35,7 @@ def run_ground(
     interval: float | None = None,
     seed: int = 0,
     columns: Path | None = None,
-    catalogue: Catalogue = CATALOGUE,
+    catalogue: Catalogue | None = None,
 ) -> Grounded:
     """Ground a model file with recordings.
 

@@ -11,7 +11,6 @@ import numpy as np
 from garat_jax import checkpoint
 from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.dynamics import Dynamics, Override
-from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.errors import UserError, choose
 from garat_jax.ground.steps import Bounds
@@ -44,7 +43,7 @@ def make_source(
 
 
 def load_grounded(
-    root: Path, configs: Mapping[str, GroundConfig], catalogue: Catalogue = CATALOGUE
+    root: Path, configs: Mapping[str, GroundConfig], catalogue: Catalogue | None = None
 ) -> Model:
     """Read a run of `garat ground`: its model, with the action transformer before it.
 

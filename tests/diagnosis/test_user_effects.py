@@ -111,6 +111,7 @@ def test_entry_points_are_loaded_and_a_bad_one_is_named(mine, monkeypatch):
     points = [importlib.metadata.EntryPoint("spring", f"{module}:Spring", group)]
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
     assert load_catalogue()["my_spring"] is cls
+    assert load_model(mine.parent / "pendulum.xml").catalogue["my_spring"] is cls
     points[:] = [importlib.metadata.EntryPoint("spring", f"{module}:Absent", group)]
     with pytest.raises(UserError, match=r"entry point spring .*AttributeError"):
         load_catalogue()
