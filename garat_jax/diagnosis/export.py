@@ -8,6 +8,8 @@ from typing import NamedTuple
 import mujoco
 
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.effects import Effect
+from garat_jax.effects.transmission import Transmission
 from garat_jax.errors import UserError
 
 
@@ -42,7 +44,7 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
         override.apply(spec)
     unsaid = tuple(
         line if effect.kind in line else f"{effect.kind} at {effect.target}: {line}"
-        for effect in model.effects
+        for effect in sorted(model.effects, key=_is_link_side)
         if (line := effect.export(spec))
     )
     _point_at_assets(spec, model.mjcf.parent, path.parent)
@@ -60,6 +62,11 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
             f"{path}: MuJoCo cannot read the model back: {' '.join(str(error).split())}"
         ) from error
     return Exported(path, unsaid)
+
+
+def _is_link_side(effect: Effect) -> bool:
+    """Sort motors that leave their joint first: what else is at the joint stays there."""
+    return not isinstance(effect, Transmission)
 
 
 def needed_files(model: Model) -> list[Path]:

@@ -19,6 +19,7 @@ from flax import struct
 
 from garat_jax.effects.at_joint import actuator_torque, at_dof, feedback, is_driven
 from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+from garat_jax.effects.motor_body import add_gear, add_motor
 
 RIGID = 1e9
 """Stiffness [N m/rad] that stands for "does not bend"."""
@@ -32,6 +33,10 @@ PARTS_OF_TRAVEL = (0.01, 0.1)
 """Parts of the way that a joint goes along the recordings at which play is tried."""
 NOWHERE = 1e9
 """Joint angle [rad] before the first substep: one that no joint has."""
+STABLE = 4.0
+"""Bound of h²·ω² + 2·h·c, below which steps of h of a spring and damper are stable."""
+MARGIN = 0.5
+"""Part of the longest stable timestep that is safe: a link may be lighter than at its reference."""
 IMPLICIT = (
     int(mujoco.mjtIntegrator.mjINT_IMPLICIT),
     int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
@@ -173,10 +178,39 @@ class Transmission(Effect, abc.ABC):
         kept = jax.tree.map(lambda new, old: new.astype(old.dtype), after, memory)
         return ctrl, at_dof(host, joint, torque, ctrl.dtype), kept
 
+    @abc.abstractmethod
+    def tie(self, tendon: mujoco.MjsTendon, timestep: float) -> str:
+        """Let a tendon, whose length is motor less joint, act as the gear; say how in words."""
+
+    @abc.abstractmethod
+    def rates(self, host: mujoco.MjModel) -> tuple[float, float]:
+        """Return how fast the exported gear turns motor against link back, 1/s², and damps, 1/s."""
+
     def export(self, spec: mujoco.MjSpec) -> str:
-        """Leave the spec as it is."""
-        del spec
-        return f"{self.kind} at {self.target} needs a second body for the motor, which is left out"
+        """Make the motor a body of its own, beside the link, and the gear a tendon between them.
+
+        The joint keeps its place, its friction, its limits and its sensors.
+        """
+        if not bool(self.active):
+            return ""
+        host = spec.copy().compile()
+        motor = add_motor(spec, host, self.name, self.inertia(host))
+        gear = add_gear(spec, self.name, motor)
+        how = self.tie(gear, spec.option.timestep)
+        said = (
+            f"{self.kind} at {self.target} as a force; instead {motor} is a body with the motor's "
+            f"inertia and actuators, and the tendon {gear.name} {how}"
+        )
+        per_angle, per_speed = (
+            rate + servo / self.inertia(host)
+            for rate, servo in zip(
+                self.rates(host), feedback(host, element_id(host, "joint", self.name)), strict=True
+            )
+        )
+        limit = STABLE / (per_speed + np.sqrt(per_speed**2 + STABLE * per_angle) + 1e-12)
+        if spec.option.timestep > (longest := MARGIN * limit):
+            said += f"; MuJoCo steps it explicitly, which needs a timestep below {longest:.2g} s"
+        return said
 
 
 def _finish(motor: Motor, angle: jax.Array, speed: jax.Array, step: float):
@@ -236,6 +270,18 @@ class JointFlexibility(Transmission):
     def active(self) -> jax.Array:
         """Whether the joint bends at all, []."""
         return jnp.asarray(self.stiffness) < RIGID
+
+    def tie(self, tendon: mujoco.MjsTendon, timestep: float) -> str:
+        """Make the tendon a spring and a damper."""
+        del timestep
+        tendon.stiffness[0], tendon.damping[0] = float(self.stiffness), float(self.damping)
+        return "is its spring and damper"
+
+    def rates(self, host: mujoco.MjModel) -> tuple[float, float]:
+        """Return what the spring and the damper do to motor against link."""
+        link = link_inertia(host, host.joint(self.name).dofadr[0])
+        mobility = 1.0 / self.inertia(host) + 1.0 / link
+        return float(self.stiffness) * mobility, float(self.damping) * mobility
 
     def slope(self, host: mujoco.MjModel) -> jax.Array:
         """Return the torque [N m s/rad] that the slip at the end of a substep gives, [].
@@ -307,6 +353,18 @@ class Backlash(Transmission):
     def active(self) -> jax.Array:
         """Whether there is any play, []."""
         return jnp.asarray(self.gap) > 0.0
+
+    def tie(self, tendon: mujoco.MjsTendon, timestep: float) -> str:
+        """Limit the tendon to the play, as stiffly as MuJoCo's limits can be."""
+        tendon.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+        tendon.range = 0.5 * float(self.gap) * np.asarray([-1.0, 1.0])
+        tendon.solref_limit = [2.0 * timestep, 1.0]
+        return f"lets both turn {float(self.gap):.4g} rad freely; its ends yield a little"
+
+    def rates(self, host: mujoco.MjModel) -> tuple[float, float]:
+        """Return zeros: limits are stable at any timestep."""
+        del host
+        return 0.0, 0.0
 
     def couple(self, model: ModelView, side: MotorSide) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Solve the motor against the link's present speed where they touch."""

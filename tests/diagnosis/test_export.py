@@ -80,6 +80,21 @@ def test_overrides_are_in_the_exported_file(tmp_path, capsys):
     np.testing.assert_allclose(simulate_plain(out), simulate_card(load_model(card)), atol=2e-4)
 
 
+def test_a_motor_leaves_its_joint_before_other_effects_come(tmp_path):
+    model = load_model(write(tmp_path))
+    effects = [
+        CATALOGUE["rotor_inertia"](target="joint/elbow", inertia=0.02),
+        CATALOGUE["joint_flexibility"](target="joint/elbow", stiffness=6.0, damping=0.05),
+    ]
+    card = load_model(save_card(tmp_path / "geared.toml", model, effects))
+    exported = export_mjcf(card, tmp_path / "geared.xml")
+    (line,) = exported.unsaid
+    assert "the tendon elbow_gear is its spring and damper" in line
+    plain = mujoco.MjModel.from_xml_path(str(exported.path))
+    armature = {name: plain.joint(name).armature[0] for name in ("elbow", "elbow_motor")}
+    assert armature == pytest.approx({"elbow": 0.02, "elbow_motor": 0.01})
+
+
 @pytest.mark.slow  # a program a kind; tests/effects has the kinds one by one
 @pytest.mark.parametrize("kind", CATALOGUE)
 def test_what_mjcf_can_say_is_the_same_physics(tmp_path, kind):

@@ -1,6 +1,7 @@
 """A motor apart from its joint, against a MuJoCo model that has it as a second body."""
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 
@@ -68,6 +69,70 @@ def test_backlash_is_two_bodies_with_play(drive, gap):
     error, without = compare(Backlash("joint/hinge", gap=gap), gear, drive)
     assert error < 3.5e-3
     assert without > 4 * error
+
+
+EXPORTED = {
+    "bends": JointFlexibility("joint/hinge", stiffness=10.0, damping=0.05),
+    "has play": Backlash("joint/hinge", gap=0.06),
+}
+
+
+@pytest.mark.parametrize("what", EXPORTED)
+@pytest.mark.parametrize("drive", ["motor", "servo"])
+def test_an_exported_gear_moves_as_the_effect_does(drive, what):
+    """5 mrad: each takes a servo on a light motor in its own way, and errs by 3 mrad at 2 ms."""
+    mjcf = {"motor": RIG, "servo": SERVO}[drive].replace("<worldbody>", CROWDED)
+    effect, ctrl = EXPORTED[what], commands(0.5)
+    exported = spec(mjcf)
+    said = effect.export(exported)
+    assert f"{effect.kind} at joint/hinge" in said
+    assert "hinge_motor" in said
+    assert "timestep" not in said
+    exported.compile()
+    model = mujoco.MjModel.from_xml_string(exported.to_xml())
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    path = []
+    for command in ctrl:
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data, 2)
+        path.append(data.joint("hinge").qpos[0])
+    angles = [predict(mjcf, effects, ctrl)[:, 0] for effects in ((effect,), ())]
+    error, without = (float(np.sqrt(np.mean((angle - path) ** 2))) for angle in angles)
+    assert error < 5e-3
+    assert without > 4 * error
+
+
+CROWDED = """
+<default><joint damping="0.01" stiffness="0" armature="0.01"/><tendon stiffness="9"/></default>
+<keyframe><key qpos="0.4"/></keyframe>
+<worldbody>
+"""
+
+
+def test_an_export_needs_a_fine_timestep_where_the_gear_is_stiff():
+    exported = spec(SERVO)
+    said = JointFlexibility("joint/hinge", stiffness=1e5).export(exported)
+    longest = float(said.partition("needs a timestep below ")[2].split()[0])
+    assert 1e-5 < longest < 1e-3
+    model = exported.compile()
+    for factor, is_stable in ((1.0, True), (2.2, False)):
+        model.opt.timestep = factor * longest
+        data = mujoco.MjData(model)
+        data.qpos[0] = 0.01
+        farthest = 0.0
+        for _ in range(300):
+            mujoco.mj_step(model, data)
+            farthest = max(farthest, np.abs(data.qpos).max())
+        assert (farthest < 0.05) == is_stable
+
+
+def test_a_rigid_motor_is_not_exported():
+    for rigid in (JointFlexibility("joint/hinge"), Backlash("joint/hinge")):
+        exported = spec(RIG)
+        before = exported.to_xml()
+        assert rigid.export(exported) == ""
+        assert exported.to_xml() == before
 
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e8])
