@@ -110,7 +110,9 @@ def save_card(path: str | Path, model: Model, extra_effects: Sequence[Effect] = 
         lines += ["", "[[override]]"]
         lines += [f"{key} = {_toml(getattr(override, key))}" for key in OVERRIDE_KEYS]
     for effect in (*model.effects, *extra_effects):
-        values = (f"{p.name} = {_toml(getattr(effect, p.name))}" for p in effect.parameters())
+        names = [p.name for p in effect.parameters()]
+        names += [name for name in effect.tables if getattr(effect, name)]
+        values = (f"{name} = {_toml(getattr(effect, name))}" for name in names)
         lines += ["", "[[effect]]", f"kind = {_toml(effect.kind)}"]
         lines += [f"target = {_toml(effect.target)}", f"parameters = {{ {', '.join(values)} }}"]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -198,18 +200,37 @@ def _effect(table: dict[str, Any], catalogue: Catalogue) -> Effect:
 
 
 def make_effect(cls: type[Effect], target: str, parameters: Mapping[str, Any]) -> Effect:
-    """Make an effect from the numbers that a user gave.
+    """Make an effect from the numbers, and the pairs of its tables, that a user gave.
 
     Raises:
-        UserError: A parameter is unknown or no finite number.
+        UserError: A parameter is unknown or no finite number, or a table is no list of pairs.
     """
-    known = [parameter.name for parameter in cls.parameters()]
+    known = [*(parameter.name for parameter in cls.parameters()), *cls.tables]
+    values = {}
     for name, value in parameters.items():
         if name not in known:
             raise unknown_name(f"parameter of {cls.kind}", name, known)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        if name in cls.tables:
+            values[name] = _pairs(f"{cls.kind} {name}", value)
+        elif _is_finite(value):
+            values[name] = float(value)
+        else:
             raise UserError(f"{cls.kind} {name} = {value!r}; expected a finite number")
-    return cls(target=target, **{name: float(value) for name, value in parameters.items()})
+    return cls(target=target, **values)
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+
+
+def _pairs(what: str, value: Any) -> tuple[tuple[float, float], ...]:
+    rows = value if isinstance(value, list) else [value]
+    for row in rows:
+        if not isinstance(row, list) or len(row) != 2 or not all(map(_is_finite, row)):
+            raise UserError(
+                f"{what} has {row!r}; expected pairs of finite numbers, such as [[0, 0], [2, 1.5]]"
+            )
+    return tuple((float(first), float(second)) for first, second in rows)
 
 
 def _toml(value: Any) -> str:

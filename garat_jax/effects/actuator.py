@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct
 
 from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+from garat_jax.errors import UserError
 
 UNLIMITED = 1e9
 """Torque [N m] that stands for "no limit"."""
@@ -280,6 +281,7 @@ class MotorCurve(Effect):
     law: ClassVar[str] = "τ = f(τ_model): linear, then an exponential towards τ_s; or a table"
     identified_by: ClassVar[str] = "commands of several sizes, slow and under a known load"
     acts: ClassVar[bool] = True
+    tables: ClassVar[tuple[str, ...]] = ("table",)
 
     saturation: jax.Array = parameter(
         UNLIMITED,
@@ -303,6 +305,20 @@ class MotorCurve(Effect):
     def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
         """Say whether the actuator is a plain motor."""
         return super().fits(host, element, name) and is_motor(host, name)
+
+    def check(self, host: mujoco.MjModel) -> None:
+        """Check the table, too.
+
+        Raises:
+            UserError: As `Effect.check`, or the table is no curve from (0, 0) on.
+        """
+        super().check(host)
+        rows = np.reshape(self.table, (-1, 2))
+        if len(rows) and (np.any(rows[0]) or np.any(np.diff(rows[:, 0]) <= 0) or rows.min() < 0):
+            raise UserError(
+                f"{self.kind} table at {self.target}: expected [linear torque, torque] from [0, 0] "
+                f"on, the first rising and neither below 0, not {rows.tolist()}"
+            )
 
     @classmethod
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:

@@ -156,6 +156,8 @@ class Effect(abc.ABC):
     """Whether `note` does anything: what is reported depends on states of some time ago."""
     refines: ClassVar[tuple[str, ...]] = ()
     """Kinds that are this law with parameters left out; they come first where they do as well."""
+    tables: ClassVar[tuple[str, ...]] = ()
+    """Fields that are known curves, pairs of numbers: cards carry them, fits leave them alone."""
     independent: ClassVar[bool] = False
     """Whether every parameter acts alone; otherwise the first one switches the others on."""
 

@@ -72,6 +72,41 @@ def test_every_effect_survives_saving(tmp_path):
     assert load_model(save_card(tmp_path / "all.toml", model, effects)).effects == tuple(effects)
 
 
+CURVE = CARD.replace("coulomb_friction", "motor_curve").replace("joint/elbow", "actuator/elbow")
+TABLE = "table = [[0, 0], [1.0, 0.9], [2, 1.5]]"
+
+
+def test_a_card_carries_the_curve_of_a_motor(tmp_path):
+    model = load_model(write(tmp_path, CURVE.replace("torque = 0.25", TABLE)))
+    (curve,) = model.effects
+    assert curve.table == ((0.0, 0.0), (1.0, 0.9), (2.0, 1.5))
+    again = load_model(save_card(tmp_path / "new.toml", model))
+    assert again.effects == model.effects
+    model.compile("mujoco")
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        (
+            "[[0, 0], [1, 2, 3]]",
+            "motor_curve table has [1, 2, 3]; expected pairs of finite numbers",
+        ),
+        ("[[0, 0], [1, inf]]", "motor_curve table has [1, inf]; expected pairs"),
+        ('"linear"', "motor_curve table has 'linear'; expected pairs"),
+        ("[[0, 0], [1, 1], [1, 2]]", "expected [linear torque, torque] from [0, 0] on, the first"),
+        ("[[0.5, 0], [1, 1]]", "motor_curve table at actuator/elbow: expected [linear torque"),
+        ("[[0, 0], [1, -1]]", "neither below 0, not [[0.0, 0.0], [1.0, -1.0]]"),
+    ],
+)
+def test_a_table_that_is_no_curve_is_refused(tmp_path, table, said):
+    path = write(tmp_path, CURVE.replace("torque = 0.25", f"table = {table}"))
+    with pytest.raises(UserError) as raised:
+        load_model(path)
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
 def test_card_elsewhere_is_refused(tmp_path):
     model = load_model(write(tmp_path))
     other = tmp_path / "other"
