@@ -127,6 +127,10 @@ class Env(abc.ABC):
         del params
         return state
 
+    def must_be_finite(self, state: EnvState) -> Any:
+        """Return the part of a state [pytree] that a sound step leaves finite."""
+        return state
+
 
 class TaskEnv(Env):
     """A task on physics: the world that agents act in; `params` are its `Dynamics`.
@@ -184,7 +188,7 @@ def guarded_step(
     last sound one. Arguments are those of `Env.step`.
     """
     after, reward, terminated, truncated = env.step(params, state, action, key)
-    faulty = ~_is_sound((after, reward))
+    faulty = ~_is_sound((env.must_be_finite(after), reward))
     kept = jax.tree.map(lambda old, new: jnp.where(faulty, old, new), state, after)
     reward = jnp.where(faulty, 0.0, reward)
     result = StepResult(kept, reward, terminated | faulty, truncated & ~faulty)
@@ -193,7 +197,8 @@ def guarded_step(
 
 def _is_sound(values: Any) -> jax.Array:
     """Say whether every float is finite and within MuJoCo's limit, []."""
-    floats = [x for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.floating)]
+    leaves = map(jnp.asarray, jax.tree.leaves(values))  # Brax has rewards that are plain numbers
+    floats = [x for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.stack([jnp.all(jnp.abs(x) < LARGEST) for x in floats]).all()
 
 

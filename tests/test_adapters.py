@@ -6,16 +6,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.envs.base import Env as BraxBase
+from brax.envs.base import State
 from brax.envs.inverted_pendulum import InvertedPendulum as BraxPendulum
 from brax.envs.wrappers import training as wrappers
 from brax.training import pmap
 from brax.training.agents.ppo import train as brax_ppo
 
+from garat_jax import rollout
 from garat_jax.adapters import brax_on_new_jax, from_brax, to_brax
-from garat_jax.agents import trpo
+from garat_jax.agents import ppo, trpo
+from garat_jax.effects import ActuatorDelay, ViscousDamping
 from garat_jax.env import EnvState, StepResult, make_world
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.errors import UserError
+from garat_jax.methods.garat import GARAT, GARATConfig
+from garat_jax.methods.gat import GAT, GATConfig
+from garat_jax.methods.grounded import Grounding
+from garat_jax.methods.transition_error import transition_error
 from tests.probe_envs import Bursting, Probe, WalkParams
 
 OLD_BRAX = pytest.mark.filterwarnings("ignore:Accessing .* directly from `Data` is deprecated")
@@ -209,3 +217,125 @@ def test_trpo_learns_on_a_brax_environment(braxs):
 def test_wrapped_brax_environments_are_refused(braxs):
     with pytest.raises(UserError, match="EpisodeWrapper wraps"):
         from_brax(wrappers.EpisodeWrapper(braxs, 10, 1), episode_length=10)
+
+
+class BraxWalk(BraxBase):
+    """A point that moves by a fifth of its action; beyond 0.9 the episode ends, beyond 0.8 at NaN.
+
+    Like environments of Brax, it has plain numbers for rewards, and infinities in what it keeps.
+    """
+
+    def __init__(self, push: float = 0.0, bursts: bool = False):
+        self.push, self.bursts = push, bursts
+
+    def reset(self, rng):
+        obs = jax.random.uniform(rng, (1,), minval=-0.1, maxval=0.1)
+        zero = jnp.zeros(())
+        return State(None, obs, zero, zero, {"distance": zero}, {"nearest": jnp.full((), jnp.inf)})
+
+    def step(self, state, action):
+        obs = state.obs + 0.2 * action + self.push
+        if self.bursts:
+            obs = jnp.where(obs > 0.8, jnp.nan, obs)
+        done = jnp.where(jnp.abs(obs[0]) > 0.9, 1.0, 0.0)
+        return state.replace(obs=obs, reward=1.0, done=done, metrics={"distance": obs[0]})
+
+    observation_size = 1
+    action_size = 1
+    backend = "none"
+
+
+def random_actions(params, obs, key):
+    del params, obs
+    return jax.random.uniform(key, (1,), minval=-1.0), jnp.zeros(())
+
+
+def test_a_brax_environment_that_fails_ends_its_episode_and_nothing_else_does():
+    record = jax.jit(rollout.record, static_argnums=(0, 2, 5, 6))
+    for bursts in (False, True):
+        env = from_brax(BraxWalk(bursts=bursts), episode_length=20)
+        transitions = record(env, None, random_actions, (), jax.random.key(0), 8, 60).transitions
+        failed = transitions.obs + 0.2 * transitions.action > 0.8
+        assert failed.any()
+        np.testing.assert_array_equal(transitions.faulty, bursts & failed[..., 0])
+        assert transitions.terminated[transitions.faulty].all()
+        assert np.isfinite(transitions.next_obs).all()
+
+
+SMALL = {"num_envs": 8, "num_steps": 16, "hidden": (8,)}
+
+
+@pytest.mark.parametrize(
+    ("method", "config"),
+    [
+        (GAT, GATConfig(**SMALL, minibatch=32, num_epochs=20, learning_rate=1e-2)),
+        (GARAT, GARATConfig(transformer=ppo.PPOConfig(**SMALL), num_minibatches=4)),
+    ],
+)
+def test_methods_ground_a_brax_environment(method, config):
+    source, target = (from_brax(BraxWalk(push), episode_length=20) for push in (0.0, -0.1))
+    recorded = rollout.record(target, None, random_actions, (), jax.random.key(1), 8, 16)
+    seen = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), recorded.transitions)
+    learner = method(source, random_actions, config)
+    state = jax.jit(lambda: learner.init(jax.random.key(0), None, (), seen))()
+    step = jax.jit(lambda state: learner.step(state, None, (), seen))
+    for _ in range(3):
+        state, metrics = step(state)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(metrics))
+    grounding = Grounding(None, state.transformer.policy)
+    error = transition_error(learner.grounded, grounding, recorded)
+    assert error.faulty_share == 0
+    assert error.mean < 0.15
+    if method is GAT:
+        assert error.mean < transition_error(source, None, recorded).mean == pytest.approx(0.1)
+    agent = trpo.make(learner.grounded, trpo.TRPOConfig(**SMALL, value_minibatch=32))
+    trained, metrics, _ = jax.jit(agent.step)(agent.init(jax.random.key(2), grounding), grounding)
+    assert np.isfinite(metrics["reward"])
+    assert trained.env_steps == 8 * 16
+
+
+def grounded_pendulum():
+    """Return an environment whose actions an untrained GARAT changes, and its parameters."""
+    world = make_world(InvertedPendulum(), engine="mujoco")
+    config = GARATConfig(transformer=ppo.PPOConfig(**SMALL), num_minibatches=4)
+
+    def uniform(params, obs, key):
+        return jax.random.uniform(key, (1,), minval=-3, maxval=3), jnp.zeros(())
+
+    recorded = rollout.record(world.env, world.params, uniform, (), jax.random.key(1), 4, 8)
+    seen = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), recorded.transitions)
+    method = GARAT(world.env, uniform, config)
+    state = method.init(jax.random.key(0), world.params, (), seen)
+    return method.grounded, Grounding(world.params, state.transformer.policy)
+
+
+def repaired_pendulum():
+    effects = (
+        ViscousDamping("joint/hinge", coefficient=0.5),
+        ActuatorDelay("actuator/slide", 0.04),
+    )
+    world = make_world(InvertedPendulum(), effects=effects, engine="mujoco")
+    return world.env, world.params
+
+
+@pytest.mark.parametrize("make", [grounded_pendulum, repaired_pendulum])
+def test_brax_trains_on_grounded_and_repaired_worlds(make):
+    history = []
+    with brax_on_new_jax():
+        brax_ppo.train(
+            to_brax(*make()),
+            num_timesteps=256,
+            episode_length=20,
+            num_envs=8,
+            num_eval_envs=4,
+            num_evals=2,
+            unroll_length=4,
+            batch_size=8,
+            num_minibatches=4,
+            num_updates_per_batch=1,
+            seed=0,
+            progress_fn=lambda steps, metrics: history.append(metrics),
+        )
+    for metrics in history:
+        assert 1 <= metrics["eval/episode_reward"] <= 20
+        assert metrics["eval/episode_faulty"] == 0

@@ -17,6 +17,7 @@ from garat_jax.env import make_world
 from garat_jax.envs.half_cheetah import HalfCheetah
 from garat_jax.envs.hopper import Hopper
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
+from garat_jax.envs.pairs import PAIRS
 from garat_jax.errors import UserError
 from garat_jax.methods.grounded import GroundedEnv, Grounding
 from tests.probe_envs import Bursting, Walk, WalkParams
@@ -58,6 +59,17 @@ def test_gymnasium_finds_nothing_wrong(make):
         warnings.filterwarnings("ignore", message=".*A Box observation space m.* value is")
         warnings.filterwarnings("ignore", message=".*recommend using a symmetric and normalized")
         check_env(to_gymnasium(*make()), skip_render_check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("which", ["source", "target"])
+def test_gymnasium_finds_nothing_wrong_with_any_world(name, which):
+    world = PAIRS[name].worlds("mujoco")[which == "target"]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*A Box observation space m.* value is")
+        warnings.filterwarnings("ignore", message=".*recommend using a symmetric and normalized")
+        check_env(to_gymnasium(world.env, world.params), skip_render_check=True)
 
 
 def test_spaces_are_the_environments():

@@ -120,6 +120,10 @@ class BraxSource(Env):
         truncated = (steps >= self.episode_length) & ~terminated
         return StepResult(EnvState(after, after.obs, steps), after.reward, terminated, truncated)
 
+    def must_be_finite(self, state: EnvState) -> jax.Array:
+        """Return the observation: what else a library keeps may be infinite and mean something."""
+        return state.obs
+
 
 def from_brax(env: Any, episode_length: int) -> BraxSource:
     """Make one of Brax's or MuJoCo Playground's environments one of ours, with no parameters.

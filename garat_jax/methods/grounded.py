@@ -6,7 +6,7 @@ transitions that look like the target's.
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -56,6 +56,10 @@ class GroundedEnv(Env):
         transform_key, key = jax.random.split(key)
         action = self.transform(params.transformer, state.obs, self.env.clip(action), transform_key)
         return self.env.step(params.env, state, action, key)
+
+    def must_be_finite(self, state: EnvState) -> Any:
+        """Return what must be finite in the environment."""
+        return self.env.must_be_finite(state)
 
 
 class TransformerParams(NamedTuple):
@@ -119,6 +123,10 @@ class TransformerEnv(Env):
         reward = self.reward(params.reward, obs, wanted, result.state.obs)
         after = self._with_action(params, result.state, agent_key)
         return result._replace(state=after, reward=reward)
+
+    def must_be_finite(self, state: EnvState) -> Any:
+        """Return what must be finite in the environment, and what the transformer sees."""
+        return state.obs, self.env.must_be_finite(state)
 
 
 def decode_action(
