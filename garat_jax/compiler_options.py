@@ -23,12 +23,17 @@ def compiler_options(dynamics: Dynamics) -> dict[str, Any]:
     not touched by them, LLVM's higher levels of optimisation cost up to a quarter of the compile
     time and save nothing; see docs/performance.md. What the user put in XLA_FLAGS stays as it is.
     """
+    return options_for(dynamics.engine, chain_depth(dynamics))
+
+
+def options_for(engine: str, depth: int) -> dict[str, Any]:
+    """Return XLA's options for an engine and a model with so deep a chain; see `chain_depth`."""
     if jax.default_backend() != "cpu":
         return {}
     options: dict[str, Any] = {}
-    if dynamics.engine == "mujoco":
+    if engine == "mujoco":
         options = {OPTIMISATION_LEVEL: 1}
-    elif chain_depth(dynamics) >= DEEP_CHAIN:
+    elif depth >= DEEP_CHAIN:
         options = {FUSION_EMITTERS: False}
     flags = os.environ.get("XLA_FLAGS", "")
     return {k: v for k, v in options.items() if k not in flags and is_known_option(k, v)}

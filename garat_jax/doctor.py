@@ -14,7 +14,12 @@ import jax.numpy as jnp
 from rich.console import Console
 
 from garat_jax import compilation_cache, dynamics, provenance
-from garat_jax.compiler_options import FUSION_EMITTERS, is_known_option
+from garat_jax.compiler_options import (
+    DEEP_CHAIN,
+    FUSION_EMITTERS,
+    compiler_options,
+    options_for,
+)
 from garat_jax.devices import use
 from garat_jax.dynamics import Dynamics, PhysicsState
 from garat_jax.overrides import load_spec
@@ -28,6 +33,8 @@ BATCHES = (1, BATCH)
 NUM_STEPS = 100
 """In one call of a program."""
 ENGINES = ("mujoco", "mjx")
+HOST_DEVICES = "xla_force_host_platform_device_count"
+"""XLA's flag that makes several devices of one CPU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +79,8 @@ def examine(device: str, seconds: float = SECONDS) -> Examination:
                 world = dynamics.compile(load_spec(PENDULUM), engine=engine)
                 for batch in BATCHES:
                     lowered, start = prepare(world, batch)
-                    prepared[engine, batch] = pool.submit(lowered.compile), start
+                    options = compiler_options(world)
+                    prepared[engine, batch] = pool.submit(lowered.compile, options), start
         rates = []
         for engine, batch in itertools.product(ENGINES, BATCHES):
             program, start = prepared[engine, batch]
@@ -88,7 +96,6 @@ def facts(devices: list[Any]) -> list[tuple[str, str]]:
     names = ", ".join(f"{kinds.count(kind)} x {kind}" for kind in dict.fromkeys(kinds))
     platform = devices[0].platform
     auto = "C MuJoCo (mujoco)" if platform == "cpu" else "MJX (mjx)"
-    known = "taken" if is_known_option(FUSION_EMITTERS) else "not known, left out"
     folder = compilation_cache.folder()
     return [
         ("machine", f"{machine['system']}, {machine['cores']} cores, {machine['memory_gib']} GiB"),
@@ -97,9 +104,15 @@ def facts(devices: list[Any]) -> list[tuple[str, str]]:
         ("engines", f"mujoco, mjx; auto takes {auto}"),
         ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
         ("XLA_FLAGS", os.environ.get("XLA_FLAGS") or "not set"),
-        ("option for deep chains", f"{FUSION_EMITTERS}=false: {known}"),
+        ("XLA options around C MuJoCo", _listed(options_for("mujoco", 0))),
+        ("XLA options for MJX", _listed(options_for("mjx", 0))),
+        ("XLA options for MJX, deep chains", _listed(options_for("mjx", DEEP_CHAIN))),
         ("compiled programs", _held(folder) if folder else "not kept"),
     ]
+
+
+def _listed(options: dict[str, Any]) -> str:
+    return ", ".join(f"{name}={str(value).lower()}" for name, value in options.items()) or "none"
 
 
 def _held(folder: Path) -> str:
@@ -152,6 +165,12 @@ def advise(rates: list[Rate], platform: str) -> list[str]:
         f"{BATCH} simulations at once do {gain:.0f} times the steps of one: "
         "run seeds together (--seeds) and give a fit several recordings."
     )
+    cores = os.cpu_count() or 1
+    if platform == "cpu" and cores > 1 and HOST_DEVICES not in os.environ.get("XLA_FLAGS", ""):
+        advice.append(
+            "C MuJoCo steps on all cores by itself; for --engine mjx try "
+            f"XLA_FLAGS=--{HOST_DEVICES}={cores}, over which garat transfer splits its work."
+        )
     if platform == "cpu" and shutil.which("nvidia-smi"):
         advice.append("JAX does not use the NVIDIA GPU: pip install 'garat_jax[cuda]'.")
     if compilation_cache.folder() is None:

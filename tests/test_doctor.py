@@ -24,14 +24,41 @@ def test_it_measures_both_engines_and_names_what_there_is(monkeypatch, capsys):
         return found[0]
 
     monkeypatch.setattr(doctor, "examine", examine)
+    monkeypatch.delenv("XLA_FLAGS", raising=False)  # the tests' own
     assert cli.main(["doctor"]) == 0
     told = capsys.readouterr().out
     for part in ("devices: ", "XLA_FLAGS: ", f"jax {jax.__version__}", "auto takes", "at once"):
         assert part in told
+    assert "XLA options around C MuJoCo: xla_backend_optimization_level=1" in told
+    assert "XLA options for MJX, deep chains: xla_cpu_use_fusion_emitters=false" in told
     assert [(rate.engine, rate.batch) for rate in found[0].rates] == [
         ("mujoco", 1), ("mujoco", BATCH), ("mjx", 1), ("mjx", BATCH),
     ]  # fmt: skip
     assert all(rate.steps_per_second > 0 for rate in found[0].rates)
+
+
+def test_it_measures_programs_as_they_are_compiled_elsewhere(monkeypatch):
+    taken = []
+
+    def compile(self, options=None, compile=jax.stages.Lowered.compile):
+        taken.append(options)
+        return compile(self, options)
+
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.setattr(jax.stages.Lowered, "compile", compile)
+    doctor.examine("auto", seconds=0.01)
+    assert taken.count({"xla_backend_optimization_level": 1}) == 2
+    assert {} in taken
+
+
+def test_it_advises_host_devices_for_mjx_where_there_are_cores(monkeypatch):
+    monkeypatch.setattr(doctor.os, "cpu_count", lambda: 6)
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    flag = "--xla_force_host_platform_device_count"
+    assert any(f"XLA_FLAGS={flag}=6" in x for x in doctor.advise(rates(2.0, 1.0), "cpu"))
+    assert not any(flag in line for line in doctor.advise(rates(1.0, 2.0), "gpu"))
+    monkeypatch.setenv("XLA_FLAGS", f"{flag}=2")
+    assert not any(flag in line for line in doctor.advise(rates(2.0, 1.0), "cpu"))
 
 
 def test_advice_follows_from_the_rates_and_the_settings(monkeypatch):
@@ -39,7 +66,7 @@ def test_advice_follows_from_the_rates_and_the_settings(monkeypatch):
     first, batch, *rest = doctor.advise(rates(2.0, 1.0), "cpu")
     assert "mujoco is 2.0 times" in first
     assert "10 times the steps of one" in batch
-    assert not [line for line in rest if "XLA_FLAGS" in line]
+    assert not [line for line in rest if line.startswith("XLA_FLAGS")]
     assert "time yours with --engine mjx" in doctor.advise(rates(1.0, 2.0), "cpu")[0]
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true")
     monkeypatch.setenv("JAX_ENABLE_COMPILATION_CACHE", "false")

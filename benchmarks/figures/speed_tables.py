@@ -86,7 +86,9 @@ def _rate(row: dict[str, Any]) -> str:
     if "ours_over_this" in row:
         return f"{rate} (× {row['ours_over_this']:.1f})"
     if row["agent"] in ALGORITHMS:
-        return f"{rate} ({100 * row['share_of_random_actions']:.0f} %)"
+        shares = [row["share_of_random_actions"], row.get("share_of_engine_alone")]
+        told = [f"{100 * share:.0f} %" for share in shares if share is not None]
+        return f"{rate} ({', '.join(told)})"
     return rate
 
 
