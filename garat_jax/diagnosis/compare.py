@@ -30,6 +30,7 @@ from garat_jax.diagnosis.segments import Grid, choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.torque import TorqueError, compare_torques
+from garat_jax.diagnosis.unseen import STILL, is_still
 from garat_jax.dynamics import native_model
 from garat_jax.effects.base import element_names
 from garat_jax.effects.catalogue import Catalogue
@@ -169,11 +170,12 @@ def compare(
     grid = choose_grid(recordings, host.opt.timestep)
     simulator = Simulator(model, (), grid)
     say("choosing the horizon")
-    stated, _ = choose_horizon(simulator, recordings, grid)
+    stated, segments = choose_horizon(simulator, recordings, grid)
     say(say_horizon(recordings, stated))
     finer = Simulator(model, (), grid, 2)
     warnings = warn_of_divergence(simulator, finer, recordings, grid, stated)
     longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
+    warnings += (STILL,) if is_still(segments) else ()
     played = {}
     for horizon in sorted({stated, *(h for h in HORIZONS if h <= longest)}):
         say(f"predicting over {horizon:g} s")

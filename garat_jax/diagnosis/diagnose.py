@@ -29,6 +29,7 @@ from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.suggest import suggest
+from garat_jax.diagnosis.unseen import is_still, unseen
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
 from garat_jax.provenance import versions
@@ -97,6 +98,8 @@ def diagnose(
         drifts=find_drifts(problem, outcome.best, everything) if outcome.best else (),
         next_experiment=next_experiment((*outcome.selected, *outcome.candidates[:1])),
         warnings=warnings,
+        unseen=unseen(problem, outcome.before),
+        still=is_still(problem.segments),
     )
 
 

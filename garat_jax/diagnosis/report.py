@@ -17,11 +17,13 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.report_data import (
     conditions_section,
     drift_section,
+    next_section,
     recordings_section,
     repeatability_section,
     residuals_section,
     side_by_side_section,
     torque_section,
+    unseen_section,
 )
 from garat_jax.diagnosis.results import OFFER, Candidate, Diagnosis, Errors, Estimate
 from garat_jax.diagnosis.view import View, leftover, look
@@ -77,7 +79,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "adequate":
         return (
             "The model is adequate: on recordings held out its error is "
-            f"{_percent(error.before)} of the signals' spread, and {floor}."
+            f"{_percent(error.before)} of the signals' spread, and {floor}{diagnosis.blindness}."
         )
     fall = (
         f"the error on recordings held out falls from {_percent(error.before)} to "
@@ -131,14 +133,15 @@ def diagnosis_sections(
     return [
         _errors(diagnosis.error, view),
         traces(view),
-        *_where(diagnosis.where, view),
+        *([] if diagnosis.verdict == "adequate" else _where(diagnosis.where, view)),
         *_ranking(diagnosis),
+        *unseen_section(diagnosis.unseen),
         *_ladder(diagnosis),
         *_parameters(diagnosis, model),
         *conditions_section(diagnosis),
         *drift_section(diagnosis.drifts),
         *repeatability_section(diagnosis),
-        *_next(diagnosis),
+        *next_section(diagnosis),
         *_left(diagnosis, view),
     ]
 
@@ -172,7 +175,7 @@ def write_comparison(
                 comparison.horizon,
             ),
             *torque_section(comparison.torques),
-            *_where(comparison.where, view),
+            *([] if comparison.near_noise else _where(comparison.where, view)),
             recordings_section(comparison.recordings),
         ],
         reproduce=Reproduce.from_config(run.read_json("config.json")),
@@ -376,15 +379,6 @@ def _parameters(diagnosis: Diagnosis, model: Model) -> list[Section]:
     columns = ["effect", "parameter", "estimate", "low", "high", "unit"]
     caption = "Estimates and their 95 % intervals; – where the recordings say nothing."
     return [Section("What was added", laws, tables=[Table(columns, rows, caption)])]
-
-
-def _next(diagnosis: Diagnosis) -> list[Section]:
-    experiment = diagnosis.next_experiment
-    if experiment is None:
-        return []
-    names = " and ".join(f"{words(n.effect)} at {n.target}" for n in experiment.separates)
-    text = f"These recordings cannot tell {names} apart.\n\n{experiment.how}"
-    return [Section("What to record next", text)]
 
 
 def _left(diagnosis: Diagnosis, view: View) -> list[Section]:

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import plotly.graph_objects as go
 
+from garat_jax.diagnosis.figures import words
 from garat_jax.diagnosis.quality import Quality
 from garat_jax.diagnosis.residuals import Residuals
-from garat_jax.diagnosis.results import Diagnosis, Drift, Named, Repeated
+from garat_jax.diagnosis.results import Diagnosis, Drift, Named, Repeated, Unseen
 from garat_jax.diagnosis.torque import TorqueError
 from garat_jax.report import COLOURS, SOFT, Figure, Section, Table, styled
 
@@ -232,6 +233,30 @@ def drift_section(drifts: Sequence[Drift]) -> list[Section]:
         "is grease that warms up. No effect of the catalogue changes with time."
     )
     return [Section("What drifts", "\n".join(lines))]
+
+
+def unseen_section(unseen: Sequence[Unseen]) -> list[Section]:
+    """Return which effects the recordings cannot show; nothing if they show all."""
+    if not unseen:
+        return []
+    rows = [(one.effect.replace("_", " "), one.target, ", ".join(one.parameters)) for one in unseen]
+    text = (
+        "An effect of these kinds and places, of a usual size, would change the signals by less "
+        "than their noise hides. That none was found does not say that there is none: record "
+        "motions in which it acts."
+    )
+    table = Table(["effect", "place", "parameters"], rows)
+    return [Section("What these recordings cannot show", text, tables=[table])]
+
+
+def next_section(diagnosis: Diagnosis) -> list[Section]:
+    """Return which experiment separates what looks alike; nothing if nothing does."""
+    experiment = diagnosis.next_experiment
+    if experiment is None:
+        return []
+    names = " and ".join(f"{words(n.effect)} at {n.target}" for n in experiment.separates)
+    text = f"These recordings cannot tell {names} apart.\n\n{experiment.how}"
+    return [Section("What to record next", text)]
 
 
 def conditions_section(diagnosis: Diagnosis) -> list[Section]:

@@ -3,7 +3,7 @@
 import dataclasses
 import html
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import plotly.graph_objects as go
@@ -22,6 +22,8 @@ OFFER = (
 TOO_COARSE = 1.0 / ABOVE_FLOOR
 """Integrator's error, relative to the signals' spread, above which a model that is as bad as always
 predicting the mean would be near the floor."""
+MOST_NAMED = 4
+"""Kinds that a sentence names of those that recordings cannot show."""
 Verdict = Literal["adequate", "missing_effect", "unexplained"]
 
 
@@ -55,6 +57,23 @@ class Named:
 
     def __str__(self) -> str:
         return f"{self.effect} at {self.target}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Unseen(Named):
+    """An effect that the recordings cannot show, and its parameters."""
+
+    parameters: tuple[str, ...]
+
+
+def list_unseen(unseen: Sequence[Unseen], most: int | None = None) -> str:
+    """Return effects, by kind and with their parameters, in words; the first `most` kinds."""
+    places: dict[str, list[str]] = {}
+    for one in unseen:
+        places.setdefault(f"{one.effect} ({', '.join(one.parameters)})", []).append(one.target)
+    named = [f"{what} at {' and '.join(at)}" for what, at in places.items()]
+    more = named[most:] if most is not None else []
+    return ", ".join(named[:most]) + (f" and {len(more)} more" if more else "")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -289,6 +308,8 @@ class Diagnosis:
     drifts: tuple[Drift, ...] = ()
     repeatability: tuple[Repeated, ...] = ()
     warnings: tuple[str, ...] = ()
+    unseen: tuple[Unseen, ...] = ()
+    still: bool = False
     conditions: Mapping[str, "Diagnosis"] = dataclasses.field(default_factory=dict)
 
     def added(self, rung: Rung) -> str:
@@ -339,7 +360,7 @@ class Diagnosis:
         if self.verdict == "adequate":
             return (
                 f"The model is adequate: its held-out error {error.before:.3g} is near the noise "
-                f"floor {floor}."
+                f"floor {floor}{self.blindness}."
             )
         names = " and ".join(str(c.named) for c in self.selected)
         if self.verdict == "missing_effect":
@@ -349,10 +370,21 @@ class Diagnosis:
             return f"Found {names} ({fall}, noise floor {floor}), but {share} stays unexplained."
         return f"Nothing in the catalogue explains the error: {share} stays unexplained."
 
+    @property
+    def blindness(self) -> str:
+        """A clause with what the recordings cannot show; empty if they show everything."""
+        why = " excite nothing (all that moves is noise): they" if self.still else ""
+        if not self.unseen:
+            return ""
+        return f", but the recordings{why} cannot show {list_unseen(self.unseen, MOST_NAMED)}"
+
     def __str__(self) -> str:
         lines = [self.sentence]
         lines += [f"  warning: {warning}" for warning in self.warnings]
-        lines += [f"  where: {place.evidence}" for place in self.where[:3]]
+        if self.verdict != "adequate":  # or what is missing is noise
+            lines += [f"  where: {place.evidence}" for place in self.where[:3]]
+        if self.unseen:
+            lines.append(f"  not shown by these recordings: {list_unseen(self.unseen)}")
         for c in self.candidates[:6]:
             fitted = f", held-out error {c.error_after:.3g}, stability {c.stability:.2f}"
             lines.append(

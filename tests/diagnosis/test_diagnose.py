@@ -51,6 +51,8 @@ def test_a_clean_model_is_adequate(tmp_path):
     assert found.verdict == "adequate"
     assert not found.selected
     assert not any(candidate.passes for candidate in found.candidates)
+    unseen = {one.effect for one in found.unseen}
+    assert not unseen & {"viscous_damping", "coulomb_friction", "motor_gain", "gravity_tilt"}
 
 
 def test_an_effect_outside_the_catalogue_is_unexplained_and_the_result_is_plain(tmp_path):
