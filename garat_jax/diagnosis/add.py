@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from garat_jax.diagnosis.diagnose import thin
-from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.differences import clear_differences, projected
+from garat_jax.diagnosis.fit import count_timestep, excited, fit
 from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
@@ -33,6 +34,7 @@ class Sized(NamedTuple):
         horizon: Seconds of the segments whose prediction error was fitted.
         error_before: Error on the recordings, relative to each signal's standard deviation.
         error_after: The same with the effect.
+        dead: Parameters that stay at no effect, because they change no signal.
     """
 
     effect: Effect
@@ -40,9 +42,15 @@ class Sized(NamedTuple):
     horizon: float
     error_before: float
     error_after: float
+    dead: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         sizes = [f"{name} = {said(e)}" for name, e in self.parameters.items()]
+        sizes += [
+            f"{name} = {getattr(self.effect, name):.4g}: it stays at no effect, the recordings do "
+            "not excite it"
+            for name in self.dead
+        ]
         return "\n".join([f"{self.effect.kind} at {self.effect.target}:", *sizes, self.change])
 
     @property
@@ -155,7 +163,7 @@ def size(
         say: Told what is being done.
 
     Raises:
-        UserError: Nothing is left to fit.
+        UserError: Nothing is left to fit, or the recordings excite none of it.
     """
     recordings = thin(recordings)
     host = native_model(model.compile(engine="mujoco"))
@@ -180,13 +188,29 @@ def size(
     metric = make_metric(dataclasses.replace(problem, fitted=~problem.fitted))
     before = settle(problem, simulator.base, segments.start)
     say(f"fitting {effect.kind} at {effect.target}")
-    best = _best_fit(problem, before, effect, given, free)
+    starts = _starts(problem, before, effect, given)
+    seen = _seen(problem, before, starts, free)
+    dead = [simulator.slots[j].parameter.name for j in free if j not in seen]
+    if not seen:
+        raise UserError(
+            f"the recordings do not excite {effect.kind} at {effect.target}: its "
+            f"{', '.join(dead)} changes no signal; record what identifies it: "
+            f"{effect.identified_by}"
+        )
+    none = effect.at(simulator.host, effect.target)
+    for theta in starts:
+        for j in set(free) - set(seen):
+            theta[j] = none[simulator.slots[j].parameter.name]
+    fits = [fit(problem, theta, before.start, seen) for theta in starts]
+    best = min(fits, key=lambda fitted: float(fitted.cost.sum()))
+    best = count_timestep(problem, best)
     return Sized(
         effect=simulator.with_parameters([float(v) for v in best.theta], [0])[0],
         parameters=estimates(problem, best),
         horizon=horizon,
         error_before=metric.error(before.residual, problem.fitted),
         error_after=metric.error(best.residual, problem.fitted),
+        dead=tuple(dead),
     )
 
 
@@ -202,17 +226,21 @@ def estimates(problem: Problem, fitted: Fit) -> dict[str, Estimate]:
     return found
 
 
-def _best_fit(problem: Problem, before: Fit, effect: Effect, given, free) -> Fit:
-    """Fit from every size at which the effect should be tried; return the best."""
+def _starts(problem: Problem, before: Fit, effect: Effect, given) -> list[np.ndarray]:
+    """List the parameters from which a fit should be tried, each [num_parameters]."""
     simulator = problem.simulator
-    fits = []
-    begun = []
-    for sizes in problem.starts(0):
-        theta = before.theta.copy()
+    thetas = [before.theta.copy() for _ in problem.starts(0)]
+    for theta, sizes in zip(thetas, problem.starts(0), strict=True):
         for j, slot in enumerate(simulator.slots):
             if slot.parameter.name in sizes and slot.parameter.name not in given:
                 theta[j] = sizes[slot.parameter.name]
-        begun.append(theta)
-    for theta in np.unique(begun, axis=0):  # those that differ in given parameters only are one
-        fits.append(fit(problem, theta, before.start, free))
-    return count_timestep(problem, min(fits, key=lambda fitted: float(fitted.cost.sum())))
+    return list(np.unique(thetas, axis=0))  # those that differ in given parameters only are one
+
+
+def _seen(problem: Problem, before: Fit, starts: Sequence[np.ndarray], free) -> list[int]:
+    """Return the parameters that change a signal at any of the sizes from which fits start."""
+    seen = np.zeros(len(free), bool)
+    for theta in starts:
+        there = clear_differences(problem, theta, before.start, free, before.sensitivity)
+        seen |= excited(problem, free, projected(problem, there.linearisation)[0])
+    return [j for j, is_seen in zip(free, seen, strict=True) if is_seen]

@@ -112,7 +112,7 @@ def fit(
             break
         is_stale = True
     lin = there.linearisation
-    keep = _excited(problem, free, projected(problem, lin)[0])
+    keep = excited(problem, free, projected(problem, lin)[0])
     cost = np.sum(settled.residual[problem.fitted] ** 2)
     if cost < SEARCHED_WITHIN * rival and not np.all(there.is_clear[keep]):
         settled = settle(problem, theta, start)
@@ -297,7 +297,7 @@ def _descend(
     return theta, start, lin
 
 
-def _excited(problem: Problem, free, sensitivity: np.ndarray) -> np.ndarray:
+def excited(problem: Problem, free, sensitivity: np.ndarray) -> np.ndarray:
     """Say which parameters would show within their bounds, [k] bool."""
     width = [
         problem.simulator.slots[j].parameter.high - problem.simulator.slots[j].parameter.low
@@ -309,7 +309,7 @@ def _excited(problem: Problem, free, sensitivity: np.ndarray) -> np.ndarray:
 def _parameter_step(problem: Problem, theta, lin: Linearisation, free, damping: float):
     """Return a damped step within the bounds [k], and which parameters are excited."""
     sensitivity, residual = projected(problem, lin)
-    keep = _excited(problem, free, sensitivity)
+    keep = excited(problem, free, sensitivity)
     slots = [problem.simulator.slots[j].parameter for j in np.asarray(free)[keep]]
     step = np.zeros(len(free))
     if not slots:

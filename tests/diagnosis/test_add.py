@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from garat_jax import cli
@@ -129,3 +130,28 @@ def test_nothing_left_to_fit_is_refused(pendulum, recorded, capsys):
     assert status == 2
     assert "every parameter is set" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_what_recordings_do_not_excite_is_refused_and_not_written(pendulum, recorded, capsys):
+    still = pendulum.parent / "still.csv"
+    rng, time = np.random.default_rng(0), np.arange(300) * 0.008
+    columns = [time, *(rng.normal(size=(2, 300)) * [[1e-4], [1e-3]]), 0.0 * time]
+    header = "time,qpos.hinge,qvel.hinge,ctrl.motor"
+    np.savetxt(still, np.stack(columns, 1), "%.8g", ",", header=header, comments="")
+    status, out = add(pendulum, "motor_gain", "--at", "actuator/motor", "--fit", str(still))
+    assert status == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "do not excite motor_gain at actuator/motor: its scale changes no signal" in line
+    assert "record what identifies it: commands of several sizes" in line
+    assert not out.exists()
+
+
+def test_one_parameter_that_is_not_excited_stays_at_no_effect(pendulum, recorded, capsys):
+    arguments = ["payload_mass", "--at", "body/pole", "--set", "x=0", "z=-0.3"]
+    status, out = add(pendulum, *arguments, "--fit", *recorded[1])
+    assert status == 0
+    (effect,) = load_model(out).effects
+    assert effect.y == 0.0  # along the axis
+    printed = capsys.readouterr().out
+    assert "y = 0: it stays at no effect, the recordings do not excite it" in printed
+    assert "mass = " in printed and "do not tell" not in printed
