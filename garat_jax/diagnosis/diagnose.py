@@ -17,6 +17,7 @@ from garat_jax.diagnosis.horizon import (
     warn_of_divergence,
 )
 from garat_jax.diagnosis.judge import SMALLEST_SHARE
+from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric, trusted
@@ -83,13 +84,16 @@ def diagnose(
     outcome = explain(problem, settled.start, say, lambda p, t: cut_longer(p, everything, grid, t))
     problem = outcome.problem
     error = _errors(problem, outcome, host, how, grid.timestep)
+    verdict = _verdict(outcome, error)
+    stays = verdict == "unexplained" and not error.is_too_coarse
+    left = leftover(problem, outcome.after, everything, host) if stays else ()
     return Diagnosis(
         model=str(model.path),
         data=tuple(r.name for r in fitted),
         holdout=tuple(r.name for r in held_out),
         versions=versions(),
         seconds=time.monotonic() - started,
-        verdict=_verdict(outcome, error),
+        verdict=verdict,
         error=error,
         where=tuple(localise(missing_torque(host, everything))),
         candidates=outcome.candidates,
@@ -100,6 +104,7 @@ def diagnose(
         warnings=warnings,
         unseen=unseen(problem, outcome.before),
         still=is_still(problem.segments),
+        left=tuple(left),
     )
 
 

@@ -60,6 +60,7 @@ class Improvement:
 
     def __str__(self) -> str:
         lines = [self.diagnosis.sentence]
+        lines += [f"  left: {line}" for line in self.diagnosis.left_lines]
         for rung in self.diagnosis.ladder:
             added = self.diagnosis.added(rung)
             lines.append(f"  {added}: held-out error {rung.error_holdout:.4g}")
@@ -148,6 +149,7 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
         error=error,
         selected=added,
         ladder=ladder,
+        left=last.left if stays else (),
         next_experiment=last.next_experiment or first.next_experiment,
     )
 

@@ -17,6 +17,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.report_data import (
     conditions_section,
     drift_section,
+    left_section,
     next_section,
     recordings_section,
     repeatability_section,
@@ -25,8 +26,8 @@ from garat_jax.diagnosis.report_data import (
     torque_section,
     unseen_section,
 )
-from garat_jax.diagnosis.results import OFFER, Candidate, Diagnosis, Errors, Estimate
-from garat_jax.diagnosis.view import View, leftover, look
+from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Estimate
+from garat_jax.diagnosis.view import View, look
 from garat_jax.report import Fact, Figure, Reproduce, Section, Table
 from garat_jax.runs import RunDirectory
 
@@ -142,7 +143,7 @@ def diagnosis_sections(
         *drift_section(diagnosis.drifts),
         *repeatability_section(diagnosis),
         *next_section(diagnosis),
-        *_left(diagnosis, view),
+        *left_section(diagnosis),
     ]
 
 
@@ -379,14 +380,6 @@ def _parameters(diagnosis: Diagnosis, model: Model) -> list[Section]:
     columns = ["effect", "parameter", "estimate", "low", "high", "unit"]
     caption = "Estimates and their 95 % intervals; – where the recordings say nothing."
     return [Section("What was added", laws, tables=[Table(columns, rows, caption)])]
-
-
-def _left(diagnosis: Diagnosis, view: View) -> list[Section]:
-    if diagnosis.verdict != "unexplained" or diagnosis.error.is_too_coarse:
-        return []
-    evidence = "\n".join(f"- {place.evidence}" for place in leftover(view)[:3])
-    text = evidence or "The torque that is still missing follows no simple pattern."
-    return [Section("What is left", f"{text}\n\n{OFFER[0].upper()}{OFFER[1:]}")]
 
 
 def _estimate(name: str, e: Estimate) -> str:

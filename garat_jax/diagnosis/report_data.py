@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from garat_jax.diagnosis.figures import words
 from garat_jax.diagnosis.quality import Quality
 from garat_jax.diagnosis.residuals import Residuals
-from garat_jax.diagnosis.results import Diagnosis, Drift, Named, Repeated, Unseen
+from garat_jax.diagnosis.results import OFFER, Diagnosis, Drift, Named, Repeated, Unseen
 from garat_jax.diagnosis.torque import TorqueError
 from garat_jax.report import COLOURS, SOFT, Figure, Section, Table, styled
 
@@ -257,6 +257,14 @@ def next_section(diagnosis: Diagnosis) -> list[Section]:
     names = " and ".join(f"{words(n.effect)} at {n.target}" for n in experiment.separates)
     text = f"These recordings cannot tell {names} apart.\n\n{experiment.how}"
     return [Section("What to record next", text)]
+
+
+def left_section(diagnosis: Diagnosis) -> list[Section]:
+    """Return what the leftover of an unexplained gap goes with; nothing of another verdict."""
+    if not diagnosis.is_left:
+        return []
+    evidence = "\n".join(f"- {line}" for line in diagnosis.left_lines)
+    return [Section("What is left", f"{evidence}\n\n{OFFER[0].upper()}{OFFER[1:]}")]
 
 
 def conditions_section(diagnosis: Diagnosis) -> list[Section]:

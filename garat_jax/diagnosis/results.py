@@ -310,6 +310,7 @@ class Diagnosis:
     warnings: tuple[str, ...] = ()
     unseen: tuple[Unseen, ...] = ()
     still: bool = False
+    left: tuple[Place, ...] = ()
     conditions: Mapping[str, "Diagnosis"] = dataclasses.field(default_factory=dict)
 
     def added(self, rung: Rung) -> str:
@@ -371,6 +372,18 @@ class Diagnosis:
         return f"Nothing in the catalogue explains the error: {share} stays unexplained."
 
     @property
+    def is_left(self) -> bool:
+        """Whether a gap stays that is the model's, not the integrator's."""
+        return self.verdict == "unexplained" and not self.error.is_too_coarse
+
+    @property
+    def left_lines(self) -> list[str]:
+        """What the gap that stays goes with, in words; nothing if none stays."""
+        lines = [place.evidence for place in self.left[:3]]
+        nothing = ["the torque that is still missing follows no simple pattern"]
+        return (lines or nothing) if self.is_left else []
+
+    @property
     def blindness(self) -> str:
         """A clause with what the recordings cannot show; empty if they show everything."""
         why = " excite nothing (all that moves is noise): they" if self.still else ""
@@ -381,7 +394,7 @@ class Diagnosis:
     def __str__(self) -> str:
         lines = [self.sentence]
         lines += [f"  warning: {warning}" for warning in self.warnings]
-        if self.verdict != "adequate":  # or what is missing is noise
+        if self.verdict != "adequate" and (self.selected or not self.is_left):
             lines += [f"  where: {place.evidence}" for place in self.where[:3]]
         if self.unseen:
             lines.append(f"  not shown by these recordings: {list_unseen(self.unseen)}")
@@ -394,10 +407,11 @@ class Diagnosis:
         for rung in self.ladder:
             errors = f"fit {rung.error_fit:.4g}, held-out {rung.error_holdout:.4g}"
             lines.append(f"  {self.added(rung)}: {errors}")
+        lines += [f"  left: {line}" for line in self.left_lines]
         lines += [f"  drift: {drift}" for drift in self.drifts]
         if self.next_experiment:
             lines.append(f"  next: {self.next_experiment.how}")
-        if self.verdict == "unexplained" and not self.error.is_too_coarse:
+        if self.is_left:
             lines.append(f"  or: {OFFER}")
         return "\n".join([*lines, *self.other_conditions])
 

@@ -4,10 +4,9 @@ import dataclasses
 from collections.abc import Sequence
 
 import mujoco
-import numpy as np
 
 from garat_jax.diagnosis.diagnose import thin
-from garat_jax.diagnosis.localise import MissingTorque, Place, localise, missing_torque
+from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
@@ -28,7 +27,6 @@ class View:
         shown: Numbers of those that the report shows the predictions of.
         before: Predictions of the model as it is, by horizon, of the recordings shown.
         after: Predictions of the repaired model; empty without a repair.
-        whole: Those of all recordings, over the longest horizon.
         missing: The torque that the model lacks, from the measurements.
         explained: The same from the repaired model's predictions.
         host: The compiled model.
@@ -38,7 +36,6 @@ class View:
     shown: Sequence[int]
     before: tuple[Replay, ...]
     after: tuple[Replay, ...]
-    whole: Replay | None
     missing: MissingTorque
     explained: MissingTorque | None
     host: mujoco.MjModel
@@ -65,23 +62,6 @@ def repaired(model: Model, selected: Sequence[Candidate]) -> Model:
     return dataclasses.replace(model, effects=(*model.effects, *as_effects(model, selected)))
 
 
-def leftover(view: View) -> list[Place]:
-    """Say what the torque that is still missing after the repair goes with, largest share first.
-
-    It is the torque that the measured motion lacks less the one that the repaired model's own
-    predictions lack by the same computation, on the same segments.
-    """
-    if view.whole is None or view.explained is None:
-        return localise(view.missing)
-    predicted = as_recordings(view.whole, view.recordings, view.host)
-    measured = [
-        dataclasses.replace(view.recordings[i], spans=made.spans)
-        for i, made in zip(np.unique(view.whole.segments.recording), predicted, strict=True)
-    ]
-    missing = missing_torque(view.host, measured)
-    return localise(missing._replace(torque=missing.torque - view.explained.torque))
-
-
 def look(
     model: Model,
     recordings: Sequence[Recording],
@@ -101,11 +81,11 @@ def look(
     longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
     horizons = [h for h in HORIZONS if h <= longest] or [longest]
     before = replay(model, recordings, dict.fromkeys(horizons, shown))
-    after, whole, explained = (), None, None
+    after, explained = (), None
     if selected:
         wanted = dict.fromkeys(horizons, shown) | {horizons[-1]: range(len(recordings))}
         *after, whole = replay(repaired(model, selected), recordings, wanted)
         after = (*after, whole.only(shown))
         explained = missing_torque(host, as_recordings(whole, recordings, host))
     missing = missing_torque(host, recordings)
-    return View(recordings, shown, before, after, whole, missing, explained, host)
+    return View(recordings, shown, before, after, missing, explained, host)

@@ -63,6 +63,8 @@ def test_an_effect_outside_the_catalogue_is_unexplained_and_the_result_is_plain(
     assert content["format"] == "garat-diagnosis/1"
     assert "NaN" not in json.dumps(content, allow_nan=False)
     assert "unexplained" in str(found)
+    assert content["left"] == []  # at no speed, command or position more than at others
+    assert "  left: the torque that is still missing follows no simple pattern" in str(found)
     assert "garat ground MODEL DATA... --method gat" in str(found)
 
 

@@ -8,7 +8,9 @@ import pytest
 
 from garat_jax.diagnosis import Diagnosis, Recording, figures, load_model
 from garat_jax.diagnosis.hidden import make_recordings
+from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import Place
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.report import diagnosis_lead, diagnosis_sections, write_diagnosis
 from garat_jax.diagnosis.results import (
     Candidate,
@@ -19,7 +21,10 @@ from garat_jax.diagnosis.results import (
     Named,
     Rung,
 )
-from garat_jax.diagnosis.view import leftover, look, repaired
+from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.view import look, repaired
 from garat_jax.runs import RunDirectory
 from tests import models
 
@@ -150,10 +155,18 @@ def test_page_of_an_adequate_model_promises_no_repair(tmp_path):
 
 
 def test_page_of_an_unexplained_gap_says_what_is_left_and_offers_to_learn_it(tmp_path):
-    page = write(tmp_path, dataclasses.replace(MISSING, verdict="unexplained", selected=()))
-    left = page.partition("<h2>What is left</h2>")[2]
-    assert "of the missing torque is at hinge, against or with the motion" in left
+    place = Place(
+        "hinge", 0.4, "at low speed", "40 % of the missing torque is at hinge, at low speed"
+    )
+    gap = dataclasses.replace(MISSING, verdict="unexplained", left=(place,))
+    left = write(tmp_path, gap).partition("<h2>What is left</h2>")[2]
+    assert place.evidence in left
     assert "garat ground MODEL DATA... --method gat" in left
+    assert f"  left: {place.evidence}" in str(gap)
+    assert gap.to_json()["left"][0]["evidence"] == place.evidence
+    without = dataclasses.replace(gap, left=())
+    assert "left: the torque that is still missing follows no simple pattern" in str(without)
+    assert "left:" not in str(MISSING)
 
 
 @pytest.mark.parametrize(
@@ -174,6 +187,16 @@ def test_lead_says_the_verdict(changes, said):
     assert said in diagnosis_lead(dataclasses.replace(MISSING, **changes))
 
 
+def what_is_left(model, recordings, selected):
+    grid = choose_grid(recordings, 0.002)
+    simulator = Simulator(repaired(model, selected), (), grid)
+    segments = cut(recordings, grid, 2.0)
+    everywhere = np.ones(len(segments.start), bool)
+    problem = Problem(simulator, simulator, segments, everywhere, grid.interval * grid.per_sample)
+    settled = settle(problem, simulator.base, segments.start)
+    return leftover(problem, settled, recordings, model.compile(engine="mujoco").host.model)
+
+
 def test_what_a_repair_explains_is_not_left(tmp_path):
     path = tmp_path / "pendulum.xml"
     path.write_text(models.PENDULUM)
@@ -186,7 +209,8 @@ def test_what_a_repair_explains_is_not_left(tmp_path):
     for played in zip(views[1].before, views[1].after, strict=True):
         spreads = [p.segments.spread for p in played]
         np.testing.assert_array_equal(*spreads)  # or errors before and after do not compare
-    shares = [{p.regime: p.share for p in leftover(view)} for view in views]
+    places = [what_is_left(model, recordings, chosen) for chosen in ((), (found,))]
+    shares = [{p.regime: p.share for p in some} for some in places]
     friction = "against or with the motion"
     assert shares[0][friction] > 0.5
     assert shares[1].get(friction, 0.0) < 0.3 * shares[0][friction]
