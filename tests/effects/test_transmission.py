@@ -8,7 +8,7 @@ import pytest
 from garat_jax import dynamics
 from garat_jax.effects import Backlash, JointFlexibility
 from garat_jax.errors import UserError
-from tests.effects.truth import RIG, SERVO, Truth, commands, predict, record
+from tests.effects.truth import RIG, SERVO, Truth, commands, predict, record, recover
 from tests.models import PENDULUM, spec
 
 TWO_BODIES = """
@@ -32,6 +32,13 @@ UNDAMPED = {
     "motor": RIG.replace(' damping="0.01"', ""),
     "servo": SERVO.replace(' damping="0.01"', ""),
 }
+
+HOST = spec(UNDAMPED["servo"]).compile()
+
+
+def play(gap: float) -> str:
+    """Return the attributes of a joint that turns freely within a gap [rad] only."""
+    return f'limited="true" range="{-gap / 2} {gap / 2}" solreflimit="0.0005 1"'
 
 
 @pytest.fixture(autouse=True)
@@ -65,10 +72,32 @@ def test_a_flexible_joint_is_two_bodies_with_a_spring(drive, stiffness, integrat
 
 @pytest.mark.parametrize(("drive", "gap"), [("motor", 0.1), ("servo", 0.02), ("servo", 0.1)])
 def test_backlash_is_two_bodies_with_play(drive, gap):
-    gear = f'limited="true" range="{-gap / 2} {gap / 2}" solreflimit="0.0005 1"'
-    error, without = compare(Backlash("joint/hinge", gap=gap), gear, drive)
+    error, without = compare(Backlash("joint/hinge", gap=gap), play(gap), drive)
     assert error < 3.5e-3
     assert without > 4 * error
+
+
+@pytest.mark.parametrize("start", [start["gap"] for start in Backlash.starts(HOST, "joint/hinge")])
+def test_play_is_recovered_from_every_size_at_which_it_is_tried(start):
+    """10 %: at 2 ms the contact yields by some 2 mrad on each side, which the fit takes off."""
+    truth = TWO_BODIES.format(gear=play(0.1), actuator=POSITION)
+    ctrl = commands(0.5)
+    runs = [(ctrl, record(truth, Truth(), ctrl))]
+    effect = Backlash("joint/hinge", gap=start)
+    found = recover(UNDAMPED["servo"], effect, {"gap": start}, runs)
+    assert found["gap"] == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize(("drive", "tried"), [("motor", 0), ("servo", 1)])
+def test_a_gear_that_bends_is_recovered_from_the_next_size_that_is_tried(drive, tried):
+    start = JointFlexibility.starts(HOST, "joint/hinge")[tried]["stiffness"]
+    gear, actuator = 'stiffness="10" damping="0.05"', {"motor": MOTOR, "servo": POSITION}[drive]
+    ctrl = commands(0.5)
+    runs = [(ctrl, record(TWO_BODIES.format(gear=gear, actuator=actuator), Truth(), ctrl))]
+    sizes = {"stiffness": start, "damping": 0.01}
+    found = recover(UNDAMPED[drive], JointFlexibility("joint/hinge", **sizes), sizes, runs)
+    assert found["stiffness"] == pytest.approx(10.0, rel=0.03)
+    assert found["damping"] == pytest.approx(0.05, rel=0.15)
 
 
 EXPORTED = {
