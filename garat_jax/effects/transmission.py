@@ -20,6 +20,7 @@ from flax import struct
 from garat_jax.effects.at_joint import actuator_torque, at_dof, feedback, is_driven
 from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
 from garat_jax.effects.motor_body import add_gear, add_motor
+from garat_jax.errors import UserError
 
 RIGID = 1e9
 """Stiffness [N m/rad] that stands for "does not bend"."""
@@ -190,12 +191,19 @@ class Transmission(Effect, abc.ABC):
         """Make the motor a body of its own, beside the link, and the gear a tendon between them.
 
         The joint keeps its place, its friction, its limits and its sensors.
+
+        Raises:
+            UserError: A name that the motor or the gear gets is taken.
         """
         if not bool(self.active):
             return ""
-        host = spec.copy().compile()
-        motor = add_motor(spec, host, self.name, self.inertia(host))
-        gear = add_gear(spec, self.name, motor)
+        try:
+            host = spec.copy().compile()
+            motor = add_motor(spec, host, self.name, self.inertia(host))
+            gear = add_gear(spec, self.name, motor)
+        except ValueError as error:
+            why = " ".join(str(error).split())
+            raise UserError(f"{self.kind} at {self.target} cannot be exported: {why}") from error
         how = self.tie(gear, spec.option.timestep)
         said = (
             f"{self.kind} at {self.target} as a force; instead {motor} is a body with the motor's "
