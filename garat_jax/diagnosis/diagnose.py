@@ -185,8 +185,10 @@ def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str, 
     shape = (-1, *segments.measured.shape[1:])
     listed = signals(host)
     per_signal = {}
-    sampled = segments.weight[held_out] > 0
     for i in range(shape[-1]):
+        sampled = segments.counts[held_out][..., i] > 0
+        if not sampled.any():
+            continue
         sizes = [
             float(np.sqrt(np.mean(residual.reshape(shape)[sampled][:, i] ** 2)))
             for residual in (

@@ -179,7 +179,7 @@ def _error(predicted: np.ndarray, segments: Segments) -> np.ndarray:
     moves = segments.spread > QUIET * segments.noise
     seen = moves if np.any(moves) else np.ones_like(moves)
     error = np.maximum(np.abs(predicted - segments.measured) - BEYOND * segments.noise, 0.0)
-    error = (error * segments.weight[..., None] / segments.spread)[..., seen].max(axis=2)
+    error = (error * segments.counts / segments.spread)[..., seen].max(axis=2)
     return _or_inf(error) / LARGEST_ERROR
 
 

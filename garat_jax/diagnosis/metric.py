@@ -20,7 +20,7 @@ class Metric(NamedTuple):
 
     Attributes:
         weight: Squared metric of one squared whitened residual, [N].
-        counted: Which residuals are samples and not padding, [S, N].
+        counted: Which residuals are measured samples, not padding or estimates, [S, N].
         trust: How much each counts in a fit and in decisions, [S, N].
         spread: What each signal's error is held against; see `segments.metric_spread`.
     """
@@ -58,8 +58,7 @@ def make_metric(problem: Problem) -> Metric:
     held_out = (s.weight > 0) & ~problem.fitted[:, None]
     spread = metric_spread(s.measured[held_out], s.noise)
     weight = np.tile((s.noise / spread) ** 2, s.measured.shape[1])
-    num_signals = s.measured.shape[2]
-    counted = np.repeat(s.weight > 0, num_signals, axis=1)
+    counted = (s.counts > 0).reshape(len(s.weight), -1)
     return Metric(weight, counted, s.trust.reshape(counted.shape), spread)
 
 

@@ -129,7 +129,7 @@ class Problem(Generic[AnySimulator]):
     def scale(self) -> np.ndarray:
         """Return what a deviation counts, [S, L, num_signals]."""
         s = self.segments
-        return s.weight[..., None] * s.trust / s.noise
+        return s.counts * s.trust / s.noise
 
     @property
     def expected(self) -> np.ndarray:

@@ -58,13 +58,24 @@ class Replay:
     @property
     def deviation(self) -> np.ndarray:
         """Prediction minus measurement, 0 where there is no sample, [S, L, num_signals]."""
-        return (self.predicted - self.segments.measured) * self.segments.weight[..., None]
+        return (self.predicted - self.segments.measured) * self.segments.counts
 
     def only(self, recordings: Sequence[int]) -> "Replay":
-        """Return the part of some recordings, by number."""
+        """Return the part of some recordings, by number; signals that none measured are left out."""
         kept = np.isin(self.segments.recording, list(recordings))
-        segments, predicted = self.segments.take(kept), self.predicted[kept]
-        return dataclasses.replace(self, segments=segments, predicted=predicted)
+        segments = self.segments.take(kept)
+        num = int(np.count_nonzero(segments.observed.any(axis=0)))  # positions, then velocities
+        segments = dataclasses.replace(
+            segments,
+            measured=segments.measured[..., :num],
+            observed=segments.observed[:, :num],
+            trust=segments.trust[..., :num],
+            noise=segments.noise[:num],
+            spread=segments.spread[:num],
+        )
+        predicted = self.predicted[kept][..., :num]
+        named = {"names": self.names[:num], "units": self.units[:num]}
+        return dataclasses.replace(self, segments=segments, predicted=predicted, **named)
 
     @property
     def spread(self) -> np.ndarray:
@@ -74,11 +85,11 @@ class Replay:
     def sizes(self) -> dict[str, Size]:
         """Return how far the predictions of each signal are off."""
         found = {}
-        sampled = self.segments.weight > 0
-        deviation = self.deviation[sampled]
-        deviations, spread = self.segments.measured[sampled].std(axis=0), self.spread
+        deviation, sampled = self.deviation, self.segments.counts > 0
+        deviations = self.segments.measured[self.segments.weight > 0].std(axis=0)
+        spread = self.spread
         for i, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
-            rmse = float(np.sqrt(np.mean(deviation[:, i] ** 2)))
+            rmse = float(np.sqrt(np.mean(deviation[..., i][sampled[..., i]] ** 2)))
             relative = rmse / float(spread[i])
             noise = float(self.segments.noise[i])
             moves = deviations[i] > QUIET * noise
@@ -168,7 +179,7 @@ def _as_recording(played: Replay, recording: Recording, members: list[int], mode
         first = int(played.segments.first[s])
         at = slice(first, first + count)
         qpos[at] = played.predicted[s, :count, :num_position]
-        if played.predicted.shape[2] > num_position:
+        if recording.velocity_measured and played.predicted.shape[2] > num_position:
             qvel[at] = played.predicted[s, :count, num_position:]
         else:
             qvel[at] = estimate_velocity(model, recording.time[at], qpos[at])

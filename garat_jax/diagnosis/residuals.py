@@ -102,6 +102,7 @@ def examine(played: Replay, recordings: Sequence[Recording], inputs: Sequence[st
     lags = min(LAGS, weight.shape[1] - 2)
     whiteness, independence = [], []
     for i, name in enumerate(played.names):
+        weight = played.segments.counts[..., i]
         residual = _centred(played.deviation[..., i], weight)
         own = _correlation(residual, residual, lags)
         num = float(weight.sum())

@@ -1,6 +1,7 @@
 """Recordings cut into segments with free initial states (multiple shooting).
 
-Signals are `qpos`, then `qvel` where every recording measured it.
+Signals are `qpos`, then `qvel` where any recording measured it. Velocities that were estimated from
+positions are no measurements: they say nothing that the positions do not, so they do not count.
 """
 
 import dataclasses
@@ -39,6 +40,7 @@ class Segments:
     Attributes:
         measured: Measured signals, [S, L, num_signals].
         weight: 1 for a sample, 0 for padding, [S, L].
+        observed: Whether a signal was measured in the segment's recording, [S, num_signals].
         trust: How much a sample's residual counts, 0 to 1, [S, L, num_signals]; see
             `metric.trusted`.
         start: Measured initial state (qpos, qvel), [S, nq + nv].
@@ -53,6 +55,7 @@ class Segments:
 
     measured: np.ndarray
     weight: np.ndarray
+    observed: np.ndarray
     trust: np.ndarray
     start: np.ndarray
     ctrl: np.ndarray
@@ -65,9 +68,15 @@ class Segments:
 
     def take(self, chosen: np.ndarray) -> "Segments":
         """Return some of the segments; noise, spread and units stay those of all."""
-        by_segment = ("measured", "weight", "trust", "start", "ctrl", "place", "recording", "first")
+        by_segment = ("measured", "weight", "observed", "trust", "start", "ctrl", "place")
+        by_segment += ("recording", "first")
         parts = {name: getattr(self, name)[chosen] for name in by_segment}
         return dataclasses.replace(self, **parts)
+
+    @property
+    def counts(self) -> np.ndarray:
+        """1 where there is a measured sample of a signal, else 0, [S, L, num_signals]."""
+        return self.weight[..., None] * self.observed[:, None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +129,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     """
     sample = grid.interval * grid.per_sample
     length = max(SHORTEST, round(horizon / sample))
-    measured_velocity = all(r.velocity_measured for r in recordings)
+    with_velocity = [r for r in recordings if r.velocity_measured]
     pieces = [
         (index, start, min(start + length, stop))
         for index, r in enumerate(recordings)
@@ -135,22 +144,29 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     rows = [_piece(recordings[i], a, b, length, steps, warm_up, grid) for i, a, b in pieces]
     measured, weight, start, ctrl, place = (np.stack(parts) for parts in zip(*rows, strict=True))
     num_position = recordings[0].qpos.shape[1]
-    num_signals = measured.shape[2] if measured_velocity else num_position
+    num_signals = measured.shape[2] if with_velocity else num_position
     deviations = np.sqrt(np.mean([signal_noise(r) ** 2 for r in recordings], axis=0))
+    if with_velocity:
+        of_velocity = np.mean([signal_noise(r) ** 2 for r in with_velocity], axis=0)
+        deviations[num_position:] = np.sqrt(of_velocity)[num_position:]
     measured = measured[..., :num_signals]
     spread = measured[weight > 0].std(axis=0)
     deviations = np.maximum(deviations[:num_signals], SMALLEST_NOISE * spread)
+    index = np.asarray([i for i, _, _ in pieces])
+    observed = np.ones((len(pieces), num_signals), bool)
+    observed[:, num_position:] = np.asarray([r.velocity_measured for r in recordings])[index, None]
     is_still = np.ptp(measured[weight > 0], axis=0) == 0
     for kind in (slice(num_position), slice(num_position, num_signals)):
         deviations[kind] = _noise_of_still(deviations[kind], is_still[kind])
     return Segments(
         measured=measured,
         weight=weight,
+        observed=observed,
         trust=np.ones_like(measured),
         start=start,
         ctrl=ctrl,
         place=place,
-        recording=np.asarray([i for i, _, _ in pieces]),
+        recording=index,
         first=np.asarray([a for _, a, _ in pieces]),
         noise=deviations,
         spread=np.maximum(spread, QUIET * deviations),

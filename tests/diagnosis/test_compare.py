@@ -111,6 +111,7 @@ def handmade(predicted, measured, weight) -> Replay:
     segments = Segments(
         measured=measured,
         weight=weight,
+        observed=np.ones((len(measured), 1), bool),
         trust=np.ones_like(measured),
         start=empty,
         ctrl=empty,

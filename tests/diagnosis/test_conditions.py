@@ -103,9 +103,10 @@ def test_each_condition_is_simulated_with_what_is_shared_and_what_is_its_own():
         measured=np.zeros((4, 1, 2)),
         recording=np.arange(4),
         **dict.fromkeys(
-            ("weight", "trust", "start", "ctrl", "place", "first", "noise", "spread", "start_unit"),
+            ("weight", "observed", "trust", "start", "ctrl", "place", "first", "noise", "spread"),
             many,
         ),
+        start_unit=many,
     )
     theta = np.stack([joint.base, 10 * joint.base])
     predicted = joint.predict(theta, np.zeros((2, 4, 2)), segments)
