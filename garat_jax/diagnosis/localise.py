@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 from scipy import signal
 
-from garat_jax.effects.base import DOFS_OF_JOINT, element_names
+from garat_jax.diagnosis.columns import signals
+from garat_jax.effects.base import DOFS_OF_JOINT, at_slide, element_names
 
 if TYPE_CHECKING:
     from garat_jax.diagnosis.measurements import Recording
@@ -21,6 +22,8 @@ WINDOW = 0.06
 """Seconds of the smoothing filter: short against a robot joint's motion."""
 SLOW = 0.25
 """Speed below which a joint counts as slow, relative to its root mean square."""
+MUCH = 0.5
+"""Part of the largest commanded torque from which commands count as large."""
 WORTH_TELLING = 0.05
 """Smallest share of the missing torque that a regime is told for."""
 
@@ -48,12 +51,14 @@ class MissingTorque(NamedTuple):
     Attributes:
         dofs: Name of each dof's joint.
         actuators: Name of each actuator.
+        slides: Whether each dof is a translation, in N and m.
         time: Seconds, [M].
         position: [M, nv]; zero for dofs of ball and free joints.
         velocity: [M, nv].
         acceleration: [M, nv].
         command: Torque of the model's actuators, [M, nv].
         load: Gravity and Coriolis torque, [M, nv].
+        contact: Torque of the model's contacts, [M, nv].
         torque: What is missing, [M, nv].
         ctrl: The actuators' commands, [M, nu].
         drive: Torque of each of the model's actuators at its joint, [M, nu].
@@ -61,12 +66,14 @@ class MissingTorque(NamedTuple):
 
     dofs: tuple[str, ...]
     actuators: tuple[str, ...]
+    slides: tuple[bool, ...]
     time: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
     acceleration: np.ndarray
     command: np.ndarray
     load: np.ndarray
+    contact: np.ndarray
     torque: np.ndarray
     ctrl: np.ndarray
     drive: np.ndarray
@@ -82,7 +89,8 @@ def missing_torque(model: mujoco.MjModel, recordings: "Sequence[Recording]") -> 
     parts = [_of_span(model, r, slice(*span)) for r in recordings for span in r.spans]
     stacked = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
     actuators = tuple(element_names(model, "actuator"))
-    return MissingTorque(_dof_names(model), actuators, *stacked)
+    slides = tuple(signal.unit == "m/s" for signal in signals(model)[model.nq :])
+    return MissingTorque(_dof_names(model), actuators, slides, *stacked)
 
 
 def localise(missing: MissingTorque) -> list[Place]:
@@ -94,54 +102,53 @@ def localise(missing: MissingTorque) -> list[Place]:
     for dof, name in enumerate(missing.dofs):
         torque = missing.torque[:, dof]
         of_joint = float(np.mean(torque**2)) / total
-        for regime, feature, words in _features(missing, dof):
+        slides = missing.slides[dof]
+        for regime, feature, unit, words in _features(missing, dof):
             norm = float(feature @ feature)
             if norm == 0.0:
                 continue
             size = float(feature @ torque) / norm
             share = of_joint * size**2 * norm / max(float(torque @ torque), 1e-300)
             if share >= WORTH_TELLING:
+                unit = at_slide(unit) if slides else unit
                 evidence = (
                     f"{100 * share:.0f} % of the missing torque is at {name}, {regime}: "
-                    + words.format(size=size, sign="with" if size > 0 else "against")
+                    f"{size:+.3g}{' ' * bool(unit)}{unit}"
+                    + words.format(sign="with" if size > 0 else "against")
                 )
                 places.append(Place(name, share, regime, evidence))
     return sorted(places, key=lambda place: -place.share)
 
 
 def _features(m: MissingTorque, dof: int):
-    """Yield (regime, feature [M], words with {size} and {sign}) for one dof."""
+    """Yield (regime, feature [M], unit of its size at a hinge, words with {sign}) for one dof."""
     speed, position = m.velocity[:, dof], m.position[:, dof]
+    command, load, contact = m.command[:, dof], m.load[:, dof], m.contact[:, dof]
     scale = float(np.sqrt(np.mean(speed**2))) + 1e-12
     direction = np.tanh(speed / (0.05 * scale))
     slow = np.abs(speed) < SLOW * scale
     ones = np.ones_like(speed)
-    yield "against or with the motion", direction, "{size:+.3g} N m {sign} the motion, at any speed"
-    yield "at low speed, around reversals", direction * slow, "{size:+.3g} N m {sign} the motion"
-    yield "in proportion to speed", speed, "{size:+.3g} N m s/rad, {sign} the motion"
-    yield (
-        "in proportion to speed squared",
-        speed * np.abs(speed),
-        "{size:+.3g} N m s²/rad², {sign} the motion",
-    )
-    yield "always", ones, "{size:+.3g} N m whatever the joint does"
-    yield "in proportion to the command", m.command[:, dof], "{size:+.3g} of the commanded torque"
-    yield (
-        "when the command changes",
-        np.gradient(m.command[:, dof]),
-        "it follows the command's changes",
-    )
-    yield "in proportion to the load", m.load[:, dof], "{size:+.3g} of the model's own load torque"
-    yield (
-        "in proportion to acceleration",
-        m.acceleration[:, dof],
-        "{size:+.3g} kg m², {sign} the acceleration",
-    )
-    yield "with position", position - position.mean(), "{size:+.3g} N m/rad"
+    yield "against or with the motion", direction, "N m", " {sign} the motion, at any speed"
+    yield "at low speed, around reversals", direction * slow, "N m", " {sign} the motion"
+    yield "in proportion to speed", speed, "N m s/rad", ", {sign} the motion"
+    square = speed * np.abs(speed)
+    yield "in proportion to speed squared", square, "N m s²/rad²", ", {sign} the motion"
+    yield "always", ones, "N m", " whatever the joint does"
+    yield "in proportion to the command", command, "", " of the commanded torque"
+    much = MUCH * float(np.abs(command).max(initial=0.0))
+    beyond = np.sign(command) * np.maximum(np.abs(command) - much, 0.0)
+    yield "when much is commanded", beyond, "", f" of the commanded torque beyond {much:.3g}"
+    yield "when the command changes", np.gradient(command), "", " of its change in a sample"
+    yield "in proportion to the load", load, "", " of the model's own load torque"
+    yield "in proportion to the contacts", contact, "", " of the model's own contact torque"
+    inertial = m.acceleration[:, dof]
+    yield "in proportion to acceleration", inertial, "kg m²", ", {sign} the acceleration"
+    yield "with position", position - position.mean(), "N m/rad", ""
     elapsed = m.time - m.time.min()
     drift = (elapsed - elapsed.mean()) / max(float(elapsed.max()), 1e-12)
-    words = "the part of the command that is missing changes by {size:+.3g} from start to end"
-    yield "drifting with time, with the command", drift * m.command[:, dof], words
+    yield "drifting with time", drift, "N m", " from start to end, whatever is commanded"
+    words = " of the commanded torque from start to end"
+    yield "drifting with time, with the command", drift * command, "", words
 
 
 def _of_span(model: mujoco.MjModel, recording: "Recording", span: slice):
@@ -160,17 +167,27 @@ def _of_span(model: mujoco.MjModel, recording: "Recording", span: slice):
         data.qacc[:], data.ctrl[:] = acceleration[k], recording.ctrl[span][k]
         mujoco.mj_inverse(model, data)
         needed, load = data.qfrc_inverse.copy(), data.qfrc_bias.copy()
+        contact = _contact_torque(model, data)
         mujoco.mj_fwdActuation(model, data)
         drive = data.actuator_force * model.actuator_gear[:, 0]
-        rows.append((needed, load, data.qfrc_actuator.copy(), drive))
-    needed, load, given, drive = (np.asarray(column) for column in zip(*rows, strict=True))
+        rows.append((needed, load, contact, data.qfrc_actuator.copy(), drive))
+    needed, load, contact, given, drive = (np.asarray(c) for c in zip(*rows, strict=True))
     both = signal.savgol_filter(np.hstack([given, drive]), size, 2, axis=0)
     given, drive = both[:, : model.nv], both[:, model.nv :]
     position = _positions(model, recording.qpos[span])
     edge = slice(size // 2, len(time) - size // 2)
-    of_dofs = (time, position, speed, acceleration, given, load, needed - given)
+    of_dofs = (time, position, speed, acceleration, given, load, contact, needed - given)
     columns = (*of_dofs, recording.ctrl[span], drive)
     return tuple(column[edge] for column in columns)
+
+
+def _contact_torque(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Return the torque of the contacts after inverse dynamics, [nv]."""
+    torque = np.zeros(model.nv)
+    if data.ncon:
+        of_contacts = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+        mujoco.mj_mulJacTVec(model, data, torque, data.efc_force * of_contacts)
+    return torque
 
 
 def _positions(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:

@@ -61,7 +61,7 @@ class Replay:
         return (self.predicted - self.segments.measured) * self.segments.counts
 
     def only(self, recordings: Sequence[int]) -> "Replay":
-        """Return the part of some recordings, by number; signals that none measured are left out."""
+        """Return the part of some recordings, by number, without signals that none measured."""
         kept = np.isin(self.segments.recording, list(recordings))
         segments = self.segments.take(kept)
         num = int(np.count_nonzero(segments.observed.any(axis=0)))  # positions, then velocities

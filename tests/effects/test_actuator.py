@@ -8,6 +8,7 @@ import pytest
 
 from garat_jax import dynamics
 from garat_jax.effects import (
+    CATALOGUE,
     ActuatorLag,
     BackEmf,
     Backlash,
@@ -17,11 +18,12 @@ from garat_jax.effects import (
     MotorDeadband,
     MotorGain,
     TorqueSaturation,
+    unit_at,
 )
 from garat_jax.effects.actuator import MINITAUR_CURVE
 from garat_jax.errors import UserError
 from tests.effects.truth import RIG, SERVO
-from tests.models import spec
+from tests.models import PENDULUM, SLIDER, spec
 
 MOTOR = "actuator/motor"
 
@@ -161,3 +163,19 @@ def test_play_is_suggested_within_the_travel():
     assert len(gaps) == 2
     assert all(0 < gap < 0.004 for gap in gaps)
     assert Backlash.suggested(np.full(9, 0.3), np.zeros(9)).starts == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "at_hinge", "at_slide"),
+    [
+        ("back_emf", ["N m s/rad"], ["N s/m"]),
+        ("torque_saturation", ["N m"], ["N"]),
+        ("motor_curve", ["N m", "N m"], ["N", "N"]),
+        ("motor_gain", ["1"], ["1"]),
+        ("actuator_delay", ["s"], ["s"]),
+    ],
+)
+def test_an_actuator_has_the_units_of_the_joint_that_it_drives(kind, at_hinge, at_slide):
+    for mjcf, target, units in ((PENDULUM, MOTOR, at_hinge), (SLIDER, "actuator/push", at_slide)):
+        host = spec(mjcf).compile()
+        assert [unit_at(p, host, target) for p in CATALOGUE[kind].parameters()] == units

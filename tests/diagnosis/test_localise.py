@@ -1,0 +1,84 @@
+"""The where-it-fails map: every regime that is hidden is named, in the units of the joint."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.localise import MUCH, MissingTorque, localise, missing_torque
+from garat_jax.diagnosis.measurements import Recording
+from tests import models
+
+TIME = np.linspace(0.0, 10.0, 2001)
+COMMAND = 2.0 * np.sin(3.1 * TIME) * np.sin(0.7 * TIME)
+CONTACT = np.maximum(np.sin(9.3 * TIME), 0.0)
+SPEED = np.cos(5.7 * TIME)
+PARTS = {
+    "in proportion to the contacts": (CONTACT, "of the model's own contact torque"),
+    "when much is commanded": (
+        np.sign(COMMAND) * np.maximum(np.abs(COMMAND) - MUCH * np.abs(COMMAND).max(), 0.0),
+        f"of the commanded torque beyond {MUCH * np.abs(COMMAND).max():.3g}",
+    ),
+    "drifting with time": (
+        TIME / 10.0 - 0.5,
+        "from start to end, whatever is commanded",
+    ),
+    "drifting with time, with the command": (
+        (TIME / 10.0 - 0.5) * COMMAND,
+        "of the commanded torque from start to end",
+    ),
+    "in proportion to speed": (SPEED, "against the motion"),
+}
+
+
+def lacking(torque, slides=False) -> MissingTorque:
+    load, rest = np.cos(1.3 * TIME), np.sin(5.7 * TIME)
+    columns = (rest / 5.7, SPEED, -5.7 * rest, COMMAND, load, CONTACT, torque)
+    nothing = np.zeros((len(TIME), 0))
+    of_dofs = (c[:, None] for c in columns)
+    return MissingTorque(("joint",), (), (slides,), TIME, *of_dofs, nothing, nothing)
+
+
+@pytest.mark.parametrize("regime", PARTS)
+def test_a_hidden_regime_comes_first_with_its_size(regime):
+    shape, words = PARTS[regime]
+    first = localise(lacking(-0.3 * shape))[0]
+    assert (first.signal, first.regime) == ("joint", regime)
+    assert first.share == pytest.approx(1.0)
+    assert first.evidence.startswith(f"100 % of the missing torque is at joint, {regime}: -0.3 ")
+    assert first.evidence.endswith(words)
+
+
+@pytest.mark.parametrize(
+    ("torque", "at_hinge", "at_slide"),
+    [
+        (-0.3 * SPEED, "-0.3 N m s/rad, against the motion", "-0.3 N s/m, against the motion"),
+        (
+            0.2 * SPEED * np.abs(SPEED),
+            "+0.2 N m s²/rad², with the motion",
+            "+0.2 N s²/m², with the motion",
+        ),
+        (np.full(len(TIME), 0.4), "+0.4 N m whatever", "+0.4 N whatever"),
+        (-1.5 * -5.7 * np.sin(5.7 * TIME), "-1.5 kg m², against", "-1.5 kg, against"),
+    ],
+)
+def test_sizes_have_the_units_of_the_joint(torque, at_hinge, at_slide):
+    for slides, words in ((False, at_hinge), (True, at_slide)):
+        places = localise(lacking(torque, slides))
+        assert any(words in place.evidence for place in places)
+        if slides:
+            assert not any("rad" in p.evidence or "N m" in p.evidence for p in places)
+
+
+def test_contacts_and_slides_are_those_of_the_model():
+    model = models.spec(models.SLIDER).compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 1000)
+    num = 100
+    recording = Recording(
+        "still.csv", np.arange(num) * 0.01, np.tile(data.qpos, (num, 1)), np.zeros((num, 2)),
+        np.zeros((num, 1)), {}, True, ((0, num),), (),
+    )  # fmt: skip
+    missing = missing_torque(model, [recording])
+    assert missing.slides == (True, True)
+    weight = 0.5 * 9.81
+    np.testing.assert_allclose(missing.contact, [[weight, 0.0]] * len(missing.time), atol=0.05)
