@@ -27,7 +27,7 @@ class Add:
     out: Annotated[Path, arg(metavar="NEW.toml")]
     """The model card to write, in the folder of the MJCF or above it."""
     set: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE...")] = ()
-    """Parameters, in SI units; those that are not given have no effect, or are fitted."""
+    """Parameters, in SI units; those that are not given leave the model as it is, or are fitted."""
     fit: Annotated[tuple[Path, ...], arg(metavar="DATA...")] = ()
     """Recordings to fit the parameters to that --set does not give."""
     map: Annotated[Path | None, arg(metavar="MAP.toml")] = None

@@ -126,14 +126,17 @@ def said(estimate: Estimate) -> str:
 def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, float]) -> Effect:
     """Make an effect of the model's catalogue, checked against the model and its bounds.
 
+    Parameters that are not given mean "no effect": what stands for a number of the model keeps it.
+
     Raises:
         UserError: The kind, the target or a parameter is unknown, a value is outside its bounds, or
             the model has this effect already.
     """
     cls = choose("effect", kind, model.catalogue)
     effect = make_effect(cls, target, values)
-    host = model.compile(engine="mujoco").host.model
+    host = native_model(model.compile(engine="mujoco"))
     effect.check(host)
+    effect = effect.replace(**{**cls.at(host, target), **values})
     for p in cls.parameters():
         if p.name in values and not p.low <= values[p.name] <= p.high:
             unit = unit_at(p, host, target)

@@ -155,3 +155,19 @@ def test_one_parameter_that_is_not_excited_stays_at_no_effect(pendulum, recorded
     printed = capsys.readouterr().out
     assert "y = 0: it stays at no effect, the recordings do not excite it" in printed
     assert "mass = " in printed and "do not tell" not in printed
+
+
+def test_what_is_not_set_keeps_what_the_model_has(tmp_path):
+    path = tmp_path / "slider.xml"
+    contact = 'solref="0.03 0.4"'
+    path.write_text(
+        models.SLIDER.replace('solref="0.03 1"', contact).replace(
+            '<geom name="floor"', f'<geom name="floor" {contact}'
+        )
+    )
+    setting = ("contact_compliance", "--at", "geom/ball", "--set", "time_constant=0.05")
+    status, out = add(path, *setting)
+    assert status == 0
+    (effect,) = load_model(out).effects
+    assert float(effect.time_constant) == 0.05
+    assert float(effect.damping_ratio) == pytest.approx(0.4)
