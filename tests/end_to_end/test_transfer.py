@@ -26,6 +26,8 @@ pytestmark = pytest.mark.slow  # a dozen programs to compile
 
 NAME = "inverted_pendulum_heavy"
 SEEDS = [0, 1]
+REPOSITORY = Path(__file__).resolve().parents[2]
+GARAT = "import sys; from garat_jax.cli import main; sys.exit(main())"
 STAGES = [
     "source policy",
     "target policy",
@@ -143,36 +145,35 @@ def test_every_pair_method_and_engine_runs_whole(tmp_path, pair, method, engine)
     assert min(result["transition_error"]["source"]) > 0
 
 
-TOGETHER = """
+TINY = """
 import sys
-from pathlib import Path
-from garat_jax import devices
-from garat_jax.transfer import run_transfer
-from tests.end_to_end.test_transfer import directory, tiny
+from garat_jax import cli, presets
+from tests.end_to_end.test_transfer import tiny
 
-devices.join_processes(None, None, None)
-run_transfer(tiny(), directory(Path(sys.argv[1])))
+small = tiny()
+presets.METHODS["garat"] = lambda pair, seeds, engine: small
+sys.exit(cli.main())
 """
+"""`garat`, in which GARAT has the settings of `tiny`."""
 
 
-def test_two_processes_find_what_one_finds(tmp_path, finished, repository):
-    address = f"localhost:{free_port()}"
-    roots = [tmp_path / "0", tmp_path / "1"]
+def start_command(*arguments: str, program: str = GARAT, **environment: str):
+    return subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", program, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=REPOSITORY,
+        env={**os.environ, "COLUMNS": "500", **environment},
+    )
+
+
+def test_the_command_in_two_processes_finds_what_one_process_finds(tmp_path, finished):
+    out = tmp_path / "run"
+    arguments = ["transfer", NAME, "--seeds", "2", "--out", str(out), "--distributed"]
+    arguments += ["--coordinator", f"localhost:{free_port()}", "--num-processes", "2"]
     processes = [
-        subprocess.Popen(
-            [sys.executable, "-W", "ignore", "-c", TOGETHER, str(root)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=repository,
-            env={
-                **os.environ,
-                "JAX_COORDINATOR_ADDRESS": address,
-                "JAX_NUM_PROCESSES": "2",
-                "JAX_PROCESS_ID": str(number),
-            },
-        )
-        for number, root in enumerate(roots)
+        start_command(*arguments, "--process-id", str(number), program=TINY) for number in range(2)
     ]
     try:
         for process in processes:
@@ -180,22 +181,13 @@ def test_two_processes_find_what_one_finds(tmp_path, finished, repository):
     finally:
         for process in processes:
             process.kill()
-    for root in roots:
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "run-process-1"}
+    for root in (out, tmp_path / "run-process-1"):
+        assert (root / "report.html").is_file()
         found = json.loads((root / "summary.json").read_text())
         for group in ("returns", "transition_error"):
             for name, numbers in finished[1][group].items():
                 np.testing.assert_allclose(found[group][name], numbers, rtol=1e-3)
-
-
-def start_command(*arguments: str) -> subprocess.Popen[str]:
-    program = "import sys; from garat_jax.cli import main; sys.exit(main())"
-    return subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", program, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "COLUMNS": "500"},
-    )
 
 
 def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> None:
