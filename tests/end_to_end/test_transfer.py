@@ -155,6 +155,23 @@ presets.METHODS["garat"] = lambda pair, seeds, engine: small
 sys.exit(cli.main())
 """
 """`garat`, in which GARAT has the settings of `tiny`."""
+COUNTED = """
+import atexit, sys
+from garat_jax import compilation_cache
+
+compilation_cache.enable()
+from jax._src import compiler
+
+compiled, compile = [], compiler.backend_compile_and_load
+
+def counted(backend, module, *arguments):
+    compiled.append(str(module.operation.attributes["sym_name"]))
+    return compile(backend, module, *arguments)
+
+compiler.backend_compile_and_load = counted
+atexit.register(lambda: print("compiled:", *compiled, file=sys.stderr))
+"""
+"""What says at the end which programs XLA compiled, and did not read from the cache."""
 
 
 def start_command(*arguments: str, program: str = GARAT, **environment: str):
@@ -188,6 +205,23 @@ def test_the_command_in_two_processes_finds_what_one_process_finds(tmp_path, fin
         for group in ("returns", "transition_error"):
             for name, numbers in finished[1][group].items():
                 np.testing.assert_allclose(found[group][name], numbers, rtol=1e-3)
+
+
+def test_the_second_start_of_a_run_compiles_nothing(tmp_path, monkeypatch):
+    for name in [name for name in os.environ if name.startswith("JAX_")]:
+        monkeypatch.delenv(name)
+    arguments = ["transfer", NAME, "--seeds", "2", "--out", str(tmp_path / "run"), "--force"]
+    compiled = []
+    for _ in range(2):
+        process = start_command(
+            *arguments, program=COUNTED + TINY, XDG_CACHE_HOME=str(tmp_path / "cache")
+        )
+        _, complaint = process.communicate(timeout=500)
+        assert process.returncode == 0, complaint
+        (line,) = [line for line in complaint.splitlines() if line.startswith("compiled:")]
+        compiled.append(line.split()[1:])
+    assert len(compiled[0]) > 10
+    assert compiled[1] == []
 
 
 def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> None:
