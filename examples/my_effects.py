@@ -11,13 +11,14 @@ from garat_jax.effects import Effect, parameter
 
 @struct.dataclass
 class ThermalFade(Effect):
-    """Commands weaken by `fade` for each unit of warmth; warmth follows u² within 0.03 s."""
+    """Commands weaken by `fade` for each unit of warmth; warmth follows u² within 20 s."""
 
     kind: ClassVar[str] = "thermal_fade"
     elements: ClassVar[tuple[str, ...]] = ("all",)
-    law: ClassVar[str] = "u ← u / (1 + fade·w), dw/dt = (u² − w) / 0.03 s"
-    identified_by: ClassVar[str] = "large commands after rest"
+    law: ClassVar[str] = "u ← u / (1 + fade·w), dw/dt = (u² − w) / 20 s"
+    identified_by: ClassVar[str] = "large commands for a minute, after rest"
     acts: ClassVar[bool] = True
+    remembers: ClassVar[bool] = True
 
     fade: jax.Array = parameter(0.0, unit="1", low=0.0, high=5.0, scale=0.05, source="our bench")
 
@@ -27,5 +28,5 @@ class ThermalFade(Effect):
 
     def apply(self, model, state, ctrl, memory):
         """Weaken the commands and warm up."""
-        memory = memory + (ctrl**2 - memory) * model.host.opt.timestep / 0.03
+        memory = memory + (ctrl**2 - memory) * model.host.opt.timestep / 20
         return ctrl / (1 + self.fade * memory), None, memory.astype(ctrl.dtype)

@@ -41,9 +41,9 @@ def test_export(capsys):
 
 
 def test_user_effect():
-    sized = run("04_user_effect.py")["sized"]
-    assert float(sized.effect.fade) == pytest.approx(0.5, rel=0.1)
-    assert sized.error_after < 0.5 * sized.error_before
+    added = run("04_user_effect.py")["added"]
+    assert float(added.model.effects[0].fade) == pytest.approx(0.5, rel=0.02)
+    assert added.sized.error_after < 0.1 * added.sized.error_before
 
 
 def test_sweep(capsys):

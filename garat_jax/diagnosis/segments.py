@@ -15,6 +15,8 @@ from garat_jax.errors import UserError
 
 WARM_UP = 0.1
 """Seconds of commands before each segment: they fill delays and activations (at most 0.1 s)."""
+LONGEST_GAP = 1.0
+"""Seconds that a gap in a recording counts at most, for what is remembered of before it."""
 UNIFORM = 0.01
 """Largest deviation of a sampling interval, relative to their median, that counts as uniform."""
 SHORTEST = 10
@@ -48,6 +50,9 @@ class Segments:
         place: Where a sample lies between simulated steps, [S, L].
         recording: Index of the recording, [S].
         first: Index of the first sample within its recording, [S].
+        past: Command of every simulated step of each recording from where it begins, padded,
+            [R, T, nu].
+        num_past: How many of these came before the warm-up, [S].
         noise: Standard deviation of each signal's noise, [num_signals].
         spread: Standard deviation of each signal, `QUIET` times its noise at least, [num_signals].
         start_unit: What the initial states differ by, a unit of each component, [nq + nv].
@@ -62,14 +67,16 @@ class Segments:
     place: np.ndarray
     recording: np.ndarray
     first: np.ndarray
+    past: np.ndarray
+    num_past: np.ndarray
     noise: np.ndarray
     spread: np.ndarray
     start_unit: np.ndarray
 
     def take(self, chosen: np.ndarray) -> "Segments":
-        """Return some of the segments; noise, spread and units stay those of all."""
+        """Return some of the segments; noise, spread, units and past stay those of all."""
         by_segment = ("measured", "weight", "observed", "trust", "start", "ctrl", "place")
-        by_segment += ("recording", "first")
+        by_segment += ("recording", "first", "num_past")
         parts = {name: getattr(self, name)[chosen] for name in by_segment}
         return dataclasses.replace(self, **parts)
 
@@ -141,6 +148,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         raise UserError(f"the recordings have no {SHORTEST} samples in a row; record for longer")
     steps = max(_steps(recordings[i].time[a:b], grid) for i, a, b in pieces)
     warm_up = warm_up_steps(grid, recordings[0].ctrl.shape[1])
+    before = [_past_steps(r, grid) for r in recordings]
     rows = [_piece(recordings[i], a, b, length, steps, warm_up, grid) for i, a, b in pieces]
     measured, weight, start, ctrl, place = (np.stack(parts) for parts in zip(*rows, strict=True))
     num_position = recordings[0].qpos.shape[1]
@@ -168,6 +176,8 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         place=place,
         recording=index,
         first=np.asarray([a for _, a, _ in pieces]),
+        past=_past(recordings, before),
+        num_past=np.asarray([max(before[i][a] - warm_up, 0) for i, a, _ in pieces]),
         noise=deviations,
         spread=np.maximum(spread, QUIET * deviations),
         start_unit=_unit(start),
@@ -253,6 +263,19 @@ def _contradictions(recording: Recording, windows: np.ndarray) -> np.ndarray:
             for size in windows
         ]
     )
+
+
+def _past_steps(recording: Recording, grid: Grid) -> np.ndarray:
+    """Return how many simulated steps before each sample its recording began, [T]."""
+    intervals = np.minimum(np.diff(recording.time), LONGEST_GAP)
+    return np.round(np.cumsum([0.0, *intervals]) / grid.interval).astype(int)
+
+
+def _past(recordings: Sequence[Recording], steps: Sequence[np.ndarray]) -> np.ndarray:
+    """Return every recording's commands by simulated steps, [R, T, nu]; gaps keep the last one."""
+    every = np.arange(max(at[-1] for at in steps))
+    held = [np.searchsorted(at, every, side="right") - 1 for at in steps]
+    return np.stack([r.ctrl[rows] for r, rows in zip(recordings, held, strict=True)])
 
 
 def _steps(time: np.ndarray, grid: Grid) -> int:

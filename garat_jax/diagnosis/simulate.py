@@ -51,11 +51,15 @@ class Program(NamedTuple):
     """A compiled program.
 
     Attributes:
-        run: Takes a batch of (theta, start, ctrl, place), and a path if it looks along one.
+        run: Takes a batch of (theta, start, ctrl, place), the past commands of all recordings with
+            each one's recording and number of them if an effect remembers, else None, and a path
+            if it looks along one.
+        remembers: Whether an effect remembers.
         is_stepped: Whether C MuJoCo is called for every physics substep.
     """
 
     run: Callable
+    remembers: bool
     is_stepped: bool
 
 
@@ -228,9 +232,14 @@ class Simulator:
 
     def _jitted(self, way: str, chosen: tuple[int, ...], function) -> Program:
         if (way, chosen) not in self._programs:
-            one = functools.partial(function, self._compile(chosen), chosen)
-            run = jax.jit(jax.vmap(one), compiler_options=self._compiler_options)
-            self._programs[way, chosen] = Program(run, way == "stepped")
+            world = self._compile(chosen)
+            acting = (*world.effects, *(self.effects[i] for i in chosen))
+            remembers = any(effect.remembers for effect in acting)
+            one = functools.partial(function, world, chosen)
+            past = (None, 0, 0) if remembers else None
+            axes = (0, 0, 0, 0, past, 0)[: 6 if way == "along" else 5]
+            run = jax.jit(jax.vmap(one, axes), compiler_options=self._compiler_options)
+            self._programs[way, chosen] = Program(run, remembers, way == "stepped")
         return self._programs[way, chosen]
 
     def _in_batches(self, program: Program, segments: Segments, theta, start, path=None):
@@ -251,7 +260,9 @@ class Simulator:
             begin = starts[chosen]
             begin[total - first :] = np.nan  # padding: C MuJoCo leaves it out
             own = theta[row, segment] if theta.ndim > 2 else theta[row]
+            past = (segments.past, segments.recording[segment], segments.num_past[segment])
             inputs = (own, begin, segments.ctrl[segment], segments.place[segment])
+            inputs = (*inputs, past if program.remembers else None)
             with jax.enable_x64(True):
                 signals, true = program.run(*inputs, *more)
                 found.append(np.asarray(signals)[..., : segments.measured.shape[2]])
@@ -273,38 +284,46 @@ class Simulator:
         acting = (effect.as_replayed() for effect in self.with_parameters(theta, chosen))
         return world.replace(effects=(*world.effects, *acting))
 
-    def _begin(self, world: dynamics.Dynamics, start):
+    def _begin(self, world: dynamics.Dynamics, start, past):
         num_position = self.host.nq
-        return dynamics.initial_state(world, start[:num_position], start[num_position:])
+        state = dynamics.initial_state(world, start[:num_position], start[num_position:])
+        if past is None:
+            return state
+        ctrl, recording, count = past
 
-    def _predict_at_once(self, world, chosen: tuple[int, ...], theta, start, ctrl, place):
+        def remember(k, state):
+            return dynamics.hold(world, state, ctrl[recording, k], self._substeps)
+
+        return jax.lax.fori_loop(0, count, remember, state)
+
+    def _predict_at_once(self, world, chosen: tuple[int, ...], theta, start, ctrl, place, past):
         """Predict one segment with candidates that do not look at the state."""
         world = self._with(world, chosen, theta)
-        return self._trace(world, start, ctrl, place, None)
+        return self._trace(world, start, ctrl, place, past, None)
 
-    def _predict_along(self, world, chosen: tuple[int, ...], theta, start, ctrl, place, path):
+    def _predict_along(self, world, chosen, theta, start, ctrl, place, past, path):
         """Predict one segment with candidates that look at a path [T + 1, nq + nv] instead."""
         world = self._with(world, chosen, theta)
         world = world.replace(effects=tuple(effect.along_path() for effect in world.effects))
         between = (path[:-1] + path[1:]) / 2
         before = jnp.broadcast_to(path[0], (self._warm_up, *path.shape[1:]))
-        return self._trace(world, start, ctrl, place, jnp.concatenate([before, between]))
+        return self._trace(world, start, ctrl, place, past, jnp.concatenate([before, between]))
 
-    def _trace(self, world: dynamics.Dynamics, start, ctrl, place, along):
-        state = self._begin(world, start)
+    def _trace(self, world: dynamics.Dynamics, start, ctrl, place, past, along):
+        state = self._begin(world, start, past)
         states = dynamics.trajectory(world, state, ctrl, self._substeps, self._warm_up, along)
         states = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), state, states)
         sensed = jax.vmap(dynamics.sensed, (None, 0))(world, states)
         signals, true = (jnp.concatenate([s.qpos, s.qvel], axis=1) for s in (sensed, states))
         return self._at_samples(signals, place), true
 
-    def _predict(self, world, chosen: tuple[int, ...], theta, start, ctrl, place):
+    def _predict(self, world, chosen: tuple[int, ...], theta, start, ctrl, place, past):
         """Predict one segment step by step: what the sensors report, and the path on the grid.
 
         During the warm-up the mechanism is held at its start.
         """
         world = self._with(world, chosen, theta)
-        state = self._begin(world, start)
+        state = self._begin(world, start, past)
 
         def whole(state):
             return jnp.concatenate([state.qpos, state.qvel])

@@ -154,6 +154,9 @@ class Effect(abc.ABC):
     """Whether `tune` does anything; it needs `reads_state`."""
     notes: ClassVar[bool] = False
     """Whether `note` does anything: what is reported depends on states of some time ago."""
+    remembers: ClassVar[bool] = False
+    """Whether `apply`'s memory reaches back further than 0.1 s: then it is followed along all the
+    recorded commands before a segment. It may not read the state."""
     refines: ClassVar[tuple[str, ...]] = ()
     """Kinds that are this law with parameters left out; they come first where they do as well."""
     tables: ClassVar[tuple[str, ...]] = ()
@@ -173,6 +176,8 @@ class Effect(abc.ABC):
         super().__init_subclass__()
         if cls.tunes and not cls.reads_state:
             raise TypeError(f"{cls.__name__} tunes the model, so it must declare reads_state")
+        if cls.remembers and cls.reads_state:
+            raise TypeError(f"{cls.__name__} remembers commands, so it may not read the state")
         if "kind" in cls.__dict__:
             cls.__annotations__["kind"] = str
             cls.kind = struct.field(pytree_node=False, default=cls.kind, kw_only=True)

@@ -118,6 +118,8 @@ def handmade(predicted, measured, weight) -> Replay:
         place=empty,
         recording=np.zeros(len(measured), int),
         first=np.arange(len(measured)) * measured.shape[1],
+        past=empty,
+        num_past=np.zeros(len(measured), int),
         noise=np.asarray([0.1]),
         spread=np.asarray([2.0]),
         start_unit=np.ones(1),
