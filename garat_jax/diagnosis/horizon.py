@@ -169,7 +169,7 @@ def _gone(
     """Say which segments diverge at the timestep, [S] bool, and at which sample each does, [S]."""
     off = _or_inf(np.abs(predicted - segments.measured) / segments.spread)
     changed = _or_inf(np.abs(predicted - halved) / segments.spread)
-    gone = (off > GONE) & (changed >= 0.5 * off) & (segments.weight[..., None] > 0)
+    gone = (off > GONE) & (changed >= 0.5 * off) & (segments.counts > 0)
     gone = np.any(gone, axis=2)
     return np.any(gone, axis=1), np.argmax(gone, axis=1)
 

@@ -12,7 +12,7 @@ from garat_jax.diagnosis.problem import Problem, block_labels
 from garat_jax.diagnosis.results import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
 from garat_jax.diagnosis.starts import Fit
-from garat_jax.effects.base import unit_at
+from garat_jax.effects.units import unit_at
 
 SMALLEST_SHARE = 0.05
 """Share of the residual that an effect must explain."""

@@ -13,7 +13,8 @@ import numpy as np
 from scipy import signal
 
 from garat_jax.diagnosis.columns import signals
-from garat_jax.effects.base import DOFS_OF_JOINT, at_slide, element_names
+from garat_jax.effects.base import DOFS_OF_JOINT, element_names
+from garat_jax.effects.units import at_slide
 
 if TYPE_CHECKING:
     from garat_jax.diagnosis.measurements import Recording

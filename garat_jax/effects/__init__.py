@@ -1,7 +1,7 @@
 """The catalogue of physical effects."""
 
 from garat_jax.effects.actuator import BackEmf, MotorCurve, MotorGain, TorqueSaturation
-from garat_jax.effects.base import Effect, ModelView, Parameter, Suggestion, parameter, unit_at
+from garat_jax.effects.base import Effect, ModelView, Parameter, Suggestion, parameter
 from garat_jax.effects.body import AirDrag, ComOffset, PayloadMass
 from garat_jax.effects.command import ActuatorDelay, ActuatorLag, MotorDeadband
 from garat_jax.effects.contact import ContactCompliance, ContactFriction
@@ -16,6 +16,7 @@ from garat_jax.effects.friction import (
 from garat_jax.effects.joint import CoggingTorque, JointStiffness, RotorInertia, TorqueOffset
 from garat_jax.effects.sensor import EncoderOffset, EncoderScale, SensorDelay
 from garat_jax.effects.transmission import Backlash, JointFlexibility
+from garat_jax.effects.units import unit_at
 from garat_jax.effects.world import GravityScale, GravityTilt
 
 CATALOGUE: dict[str, type[Effect]] = {
