@@ -100,7 +100,7 @@ def diagnose(
         selected=outcome.selected,
         ladder=_ladder(problem, outcome),
         drifts=find_drifts(problem, outcome.best, everything) if outcome.best else (),
-        next_experiment=next_experiment((*outcome.selected, *outcome.candidates[:1])),
+        next_experiment=next_experiment((*outcome.selected, *outcome.candidates[:1]), host),
         warnings=warnings,
         unseen=unseen(problem, outcome.before),
         still=is_still(problem.segments),

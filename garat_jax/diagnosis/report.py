@@ -334,7 +334,9 @@ def _ranking(diagnosis: Diagnosis) -> list[Section]:
     return [
         Section(
             "Which effects could explain it",
-            "Every effect of the catalogue was tried at every place of the model. Only one that "
+            "Every effect of the catalogue was tried wherever it can act: not at parts without a "
+            "name, and not where a part lacks what it needs, as a joint without armature does for "
+            "flexibility, or a geom that touches nothing for friction. Only one that "
             "explains much, that makes the error fall on recordings it was not fitted to, that "
             "leads over all others for certain and that has a possible sign is added.",
             figures=drawn,

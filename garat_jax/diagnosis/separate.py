@@ -2,7 +2,11 @@
 
 from collections.abc import Sequence
 
-from garat_jax.diagnosis.results import Candidate, Experiment
+import mujoco
+
+from garat_jax.diagnosis.results import Candidate, Experiment, Named
+from garat_jax.effects.base import element_id
+from garat_jax.effects.contact import partners
 
 EXPERIMENTS: dict[frozenset[str], str] = {
     frozenset({"motor_gain", "payload_mass"}): (
@@ -46,20 +50,60 @@ EXPERIMENTS: dict[frozenset[str], str] = {
     ),
 }
 """By pairs of kinds."""
-DEFAULT = (
-    "record with twice the amplitude and with faster and slower commands, "
-    "so that torque, speed and acceleration do not rise and fall together"
+NONE = (
+    "no recording of this model tells {first} from the same at {other}: they touch nothing but "
+    "each other, and their one contact has one {kind}; name either"
 )
+"""Of one kind at two geoms that make one contact."""
+UNKNOWN = (
+    "no experiment is known that tells {first} from {second}; garat plan MODEL --separate "
+    "{first_place} {second_place} looks for commands that do, and says how far they do"
+)
+"""Of other pairs, where there are commands."""
+UNKNOWN_PASSIVE = (
+    "no experiment is known that tells {first} from {second}; recordings from other initial states "
+    "and at other amplitudes may"
+)
+"""Of other pairs, where there are none."""
 
 
-def next_experiment(candidates: Sequence[Candidate]) -> Experiment | None:
-    """Return the experiment that separates the first candidate with unlike explanations."""
+def next_experiment(candidates: Sequence[Candidate], host: mujoco.MjModel) -> Experiment | None:
+    """Return the experiment that separates the first candidate with unlike explanations.
+
+    Args:
+        candidates: What was found.
+        host: The compiled model: its actuators, and which geoms can touch.
+    """
     for candidate in candidates:
         if candidate.indistinguishable_from:
             others = candidate.indistinguishable_from
-            ways = dict.fromkeys(
-                EXPERIMENTS.get(frozenset({candidate.effect, other.effect}), DEFAULT)
-                for other in others
-            )
+            ways = dict.fromkeys(_way(candidate.named, other, host) for other in others)
             return Experiment((candidate.named, *others), "; ".join(ways))
     return None
+
+
+def _way(first: Named, second: Named, host: mujoco.MjModel) -> str:
+    """Return what separates two effects, or that nothing does, in words."""
+    if known := EXPERIMENTS.get(frozenset({first.effect, second.effect})):
+        return known
+    if first.effect == second.effect and _make_one_contact(host, first.target, second.target):
+        kind = first.effect.replace("_", " ")
+        return NONE.format(first=first, other=second.target, kind=kind)
+    places = [f"{named.effect}@{named.target}" for named in (first, second)]
+    words = UNKNOWN if host.nu else UNKNOWN_PASSIVE
+    return words.format(first=first, second=second, first_place=places[0], second_place=places[1])
+
+
+def _make_one_contact(host: mujoco.MjModel, first: str, second: str) -> bool:
+    """Say whether two targets are geoms that can touch nothing but each other."""
+    if not first.startswith("geom/") or not second.startswith("geom/"):
+        return False
+    a, b = (element_id(host, "geom", target.partition("/")[2]) for target in (first, second))
+    named = list(zip(host.pair_geom1.tolist(), host.pair_geom2.tolist(), strict=True))
+    touched = {geom: set(partners(host, geom)) for geom in (a, b)}
+    for one, other in named:
+        if one in touched:
+            touched[one].add(other)
+        if other in touched:
+            touched[other].add(one)
+    return touched == {a: {b}, b: {a}}

@@ -13,7 +13,6 @@ from garat_jax.diagnosis.convert import free_pendulum
 from garat_jax.diagnosis.diagnose import is_explained
 from garat_jax.diagnosis.hidden import DRAWN, OUTSIDE, make_recordings
 from garat_jax.diagnosis.results import Errors
-from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.runs import RunDirectory
 
 PENDULUM = Path(__file__).parents[2] / "envs" / "assets" / "pendulum.xml"
@@ -129,4 +128,4 @@ def test_the_command_writes_the_diagnosis_and_a_report(tmp_path):
     assert found.selected[0].effect == "torque_offset"
     assert run.read_json("diagnosis.json")["holdout"] == ["recording_2.csv"]
     assert (run.root / "report.html").is_file()
-    assert next_experiment(found.selected) is None
+    assert found.next_experiment is None

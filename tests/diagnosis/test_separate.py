@@ -1,0 +1,43 @@
+"""What separates effects that look alike, and that nothing does where that is so."""
+
+import dataclasses
+
+import mujoco
+import pytest
+
+from garat_jax.diagnosis.results import Named
+from garat_jax.diagnosis.separate import next_experiment
+from tests import models
+from tests.diagnosis.test_diagnosis_report import FRICTION
+
+SECOND = """<body pos="0 1 0.2"><freejoint/><geom name="second" size="0.1"/></body></worldbody>"""
+
+
+def ask(first: Named, second: Named, text: str = models.SLIDER) -> str:
+    candidate = dataclasses.replace(
+        FRICTION, effect=first.effect, target=first.target, indistinguishable_from=(second,)
+    )
+    found = next_experiment([candidate], mujoco.MjModel.from_xml_string(text))
+    assert found and found.separates == (first, second)
+    return found.how
+
+
+def test_known_pairs_have_their_experiment():
+    how = ask(Named("motor_gain", "actuator/motor"), Named("payload_mass", "body/puck"))
+    assert "known mass attached" in how
+
+
+@pytest.mark.parametrize("more", [False, True])
+def test_one_contact_cannot_be_told_from_its_other_side(more):
+    text = models.SLIDER.replace("</worldbody>", SECOND) if more else models.SLIDER
+    pair = Named("contact_friction", "geom/ball"), Named("contact_friction", "geom/floor")
+    how = ask(*pair, text)
+    assert ("touch nothing but each other" in how) is not more
+
+
+def test_of_other_pairs_nothing_untrue_is_promised():
+    pair = Named("torque_offset", "joint/hinge"), Named("cogging_torque", "joint/hinge")
+    how = ask(*pair, models.PENDULUM)
+    assert "no experiment is known" in how
+    assert "--separate torque_offset@joint/hinge cogging_torque@joint/hinge" in how
+    assert "garat plan" not in ask(*pair, models.TUMBLER)  # no commands
