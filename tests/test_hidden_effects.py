@@ -25,7 +25,7 @@ from benchmarks.hidden.score import NOT_YET, aggregate, score
 from benchmarks.hidden.secrets import OUTSIDE, SIZES
 from garat_jax.diagnosis import Recording, diagnose, load_model
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.results import Candidate, Estimate, Interval, Named
+from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
 
 SCENES = Surveys()
 TIME = np.arange(60) / 200.0

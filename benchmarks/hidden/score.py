@@ -11,9 +11,9 @@ from scipy import stats
 
 from garat_jax.diagnosis import Diagnosis, Model, Recording
 from garat_jax.diagnosis.diagnose import split, thin
+from garat_jax.diagnosis.findings import Candidate, Named
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Candidate, Named
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle

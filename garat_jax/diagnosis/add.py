@@ -9,13 +9,13 @@ import numpy as np
 
 from garat_jax.diagnosis.diagnose import thin
 from garat_jax.diagnosis.differences import clear_differences, projected
+from garat_jax.diagnosis.findings import Estimate
 from garat_jax.diagnosis.fit import count_timestep, excited, fit
 from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Estimate
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit, settle

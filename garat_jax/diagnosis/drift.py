@@ -10,9 +10,9 @@ import numpy as np
 from scipy import stats
 
 from garat_jax.diagnosis.differences import clear_differences
+from garat_jax.diagnosis.findings import Drift, Estimate
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels, tall
-from garat_jax.diagnosis.results import Drift, Estimate
 from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.starts import Fit
 from garat_jax.effects import unit_at

@@ -6,10 +6,11 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
+from garat_jax.diagnosis.findings import Candidate, Named
 from garat_jax.diagnosis.localise import MissingTorque, Place
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.replay import Replay
-from garat_jax.diagnosis.results import Candidate, Diagnosis, Named
+from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.report import COLOURS, SOFT, styled
 
 AFTER, BEFORE, GOOD = COLOURS[0], COLOURS[1], COLOURS[2]

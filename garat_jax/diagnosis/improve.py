@@ -14,6 +14,7 @@ from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.conditions import add_conditions, read_conditions, write_cards
 from garat_jax.diagnosis.diagnose import diagnose, is_explained, metric_in_words, split, thin
 from garat_jax.diagnosis.export import copy_model, needed_files
+from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric, noise_floor
@@ -23,7 +24,7 @@ from garat_jax.diagnosis.progress import progress
 from garat_jax.diagnosis.repeat import found_theta, nominal_effects, repeatability
 from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosis_sections
 from garat_jax.diagnosis.report_conditions import condition_sections
-from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
+from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle

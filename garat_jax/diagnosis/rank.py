@@ -20,6 +20,7 @@ from garat_jax.diagnosis.contend import (
     with_evidence,
     with_twins,
 )
+from garat_jax.diagnosis.findings import Candidate, Named
 from garat_jax.diagnosis.fit import count_timestep, fit
 from garat_jax.diagnosis.judge import (
     NO_CERTAIN_LEAD,
@@ -31,7 +32,6 @@ from garat_jax.diagnosis.judge import (
 )
 from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor, trusted
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Candidate, Named
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.steps import Step, prune, refitted, swap

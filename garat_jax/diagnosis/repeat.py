@@ -12,6 +12,7 @@ import numpy as np
 from scipy import stats
 
 from garat_jax.diagnosis.diagnose import make_candidates, split, thin
+from garat_jax.diagnosis.findings import Candidate, Named, Repeated, Sighting
 from garat_jax.diagnosis.fit import count_timestep, fit
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import TOO_CLOSE
@@ -19,7 +20,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Candidate, Diagnosis, Named, Repeated, Sighting
+from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator

@@ -11,6 +11,7 @@ from garat_jax import report
 from garat_jax.diagnosis import figures
 from garat_jax.diagnosis.diagnose import split
 from garat_jax.diagnosis.figures import label, was_fitted, words
+from garat_jax.diagnosis.findings import Candidate, Estimate
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
@@ -26,7 +27,7 @@ from garat_jax.diagnosis.report_data import (
     torque_section,
     unseen_section,
 )
-from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Estimate
+from garat_jax.diagnosis.results import Diagnosis, Errors
 from garat_jax.diagnosis.view import View, look
 from garat_jax.report import Fact, Figure, Reproduce, Section, Table
 from garat_jax.runs import RunDirectory

@@ -7,9 +7,10 @@ import numpy as np
 import plotly.graph_objects as go
 
 from garat_jax.diagnosis.figures import words
+from garat_jax.diagnosis.findings import Drift, Named, Repeated, Unseen
 from garat_jax.diagnosis.quality import Quality
 from garat_jax.diagnosis.residuals import Residuals
-from garat_jax.diagnosis.results import OFFER, Diagnosis, Drift, Named, Repeated, Unseen
+from garat_jax.diagnosis.results import OFFER, Diagnosis
 from garat_jax.diagnosis.torque import TorqueError
 from garat_jax.report import COLOURS, SOFT, Figure, Section, Table, styled
 

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import mujoco
 
-from garat_jax.diagnosis.results import Candidate, Experiment, Named
+from garat_jax.diagnosis.findings import Candidate, Named
+from garat_jax.diagnosis.results import Experiment
 from garat_jax.effects.base import element_id
 from garat_jax.effects.contact import partners
 

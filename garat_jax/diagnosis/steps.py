@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from garat_jax.diagnosis.contend import Contender, complete
+from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import leads
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Candidate
 from garat_jax.diagnosis.starts import Fit
 
 

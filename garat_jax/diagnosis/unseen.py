@@ -3,8 +3,8 @@
 import numpy as np
 
 from garat_jax.diagnosis.evidence import Evidence
+from garat_jax.diagnosis.findings import Unseen
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Unseen
 from garat_jax.diagnosis.screen import SCREENED
 from garat_jax.diagnosis.segments import QUIET, Segments
 from garat_jax.diagnosis.simulate import Simulator

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 import mujoco
 
 from garat_jax.diagnosis.diagnose import thin
+from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
-from garat_jax.diagnosis.results import Candidate
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
 

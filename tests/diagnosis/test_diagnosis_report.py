@@ -7,20 +7,13 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis import Diagnosis, Recording, figures, load_model
+from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.report import diagnosis_lead, diagnosis_sections, write_diagnosis
-from garat_jax.diagnosis.results import (
-    Candidate,
-    Errors,
-    Estimate,
-    Experiment,
-    Interval,
-    Named,
-    Rung,
-)
+from garat_jax.diagnosis.results import Errors, Experiment, Rung
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle

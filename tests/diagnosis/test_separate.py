@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import pytest
 
-from garat_jax.diagnosis.results import Named
+from garat_jax.diagnosis.findings import Named
 from garat_jax.diagnosis.separate import next_experiment
 from tests import models
 from tests.diagnosis.test_diagnosis_report import FRICTION

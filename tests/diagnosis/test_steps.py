@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis.contend import Contender
+from garat_jax.diagnosis.findings import Candidate, Interval, Named
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Candidate, Interval, Named
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
