@@ -31,8 +31,8 @@ PARTLY = {
     "cogging_torque": ({"amplitude": 0.2}, "no words"),
     "motor_deadband": ({"width": 0.1}, "no words"),
     "motor_curve": ({"saturation": 1.0}, "no words"),
-    "backlash": ({"gap": 0.1}, "second body"),
-    "joint_flexibility": ({"stiffness": 10.0}, "second body"),
+    "backlash": ({"gap": 0.1}, "hinge_motor is a body"),
+    "joint_flexibility": ({"stiffness": 10.0}, "hinge_motor is a body"),
 }
 
 
