@@ -1,4 +1,4 @@
-# make demo | test | check | build | setup | format | clean
+# make demo | test | check | build | setup | peers | format | clean
 
 PYTHON ?= python3
 VENV := .venv
@@ -9,7 +9,7 @@ OUT ?= runs/demo
 MEASUREMENTS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check static format build clean
+.PHONY: help setup peers demo test check static format build clean
 .NOTPARALLEL:
 
 help:
@@ -19,6 +19,7 @@ help:
 	@echo "make check   format, lint, types, import contracts, tests"
 	@echo "make build   the wheel, and a trial of it in a clean environment"
 	@echo "make setup   only what the others need: $(VENV) with the locked dependencies"
+	@echo "make peers   the libraries beside which adapters are tested and speed is measured"
 	@echo "make format  put the code into its format"
 	@echo "make clean   remove builds and caches, not $(VENV) and not runs"
 
@@ -42,6 +43,9 @@ install-without-locked-nightly:
 		|| $(PIP) install --quiet --no-deps 'tensorflow-probability>=0.26'
 	@$(BIN)/python -W ignore -c 'import distrax' \
 		|| { echo "make setup: distrax does not work with the build that was found" >&2; exit 1; }
+
+peers: setup
+	$(PIP) install --quiet -c requirements.lock -r requirements-peers.lock
 
 demo: setup
 	$(BIN)/garat demo --out $(OUT) --force $(if $(MEASUREMENTS),--measurements $(MEASUREMENTS))

@@ -13,11 +13,12 @@ from packaging.utils import canonicalize_name
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 LOCK = REPOSITORY / "requirements.lock"
+PEERS = REPOSITORY / "requirements-peers.lock"
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
-def locked() -> dict[str, Requirement]:
-    lines = LOCK.read_text(encoding="utf-8").splitlines()
+def locked(lock: Path = LOCK) -> dict[str, Requirement]:
+    lines = lock.read_text(encoding="utf-8").splitlines()
     requirements = [Requirement(line) for line in lines if line and not line.startswith("#")]
     return {canonicalize_name(requirement.name): requirement for requirement in requirements}
 
@@ -35,8 +36,22 @@ def test_the_nightly_range_takes_later_builds_and_releases():
     assert not specifier.contains("0.25.0.dev20240101")
 
 
-def test_the_lock_names_no_place_to_install_from():
-    text = LOCK.read_text(encoding="utf-8")
+def test_the_peers_versions_are_exact_and_none_is_locked_twice():
+    assert not locked(PEERS).keys() & locked().keys()
+    for name, requirement in locked(PEERS).items():
+        assert [s.operator for s in requirement.specifier] == ["=="], name
+
+
+@pytest.mark.parametrize("line", PROJECT["optional-dependencies"]["bench"])
+def test_what_the_bench_extra_asks_for_is_locked_to_a_version_that_it_accepts(line):
+    wanted = Requirement(line)
+    (exact,) = (locked() | locked(PEERS))[canonicalize_name(wanted.name)].specifier
+    assert wanted.specifier.contains(exact.version), line
+
+
+@pytest.mark.parametrize("lock", [LOCK, PEERS], ids=lambda lock: lock.name)
+def test_the_locks_name_no_place_to_install_from(lock):
+    text = lock.read_text(encoding="utf-8")
     assert not re.search(r"https?:|file:|--index-url|--extra-index-url|--find-links|\s@\s", text)
 
 

@@ -10,7 +10,7 @@ from garat_jax.adapters import to_gymnasium, to_gymnasium_vector
 from tests.probe_envs import Walk, WalkParams
 from tests.test_gymnasium import grounded, plain, repaired
 
-REASON = "stable-baselines3 is not installed; it comes with pip install garat_jax[bench]"
+REASON = "stable-baselines3 is not installed; it comes with make peers"
 
 with warnings.catch_warnings():  # torch's own deprecations
     warnings.simplefilter("ignore")
