@@ -44,6 +44,7 @@ class Pair:
         target: Overrides that make the target.
         source_effects: Physical effects that the source has.
         target_effects: Physical effects that the target has.
+        max_iterations: Of training a policy until it solves either world.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Pair:
     target: tuple[Override, ...]
     source_effects: tuple[Effect, ...] = ()
     target_effects: tuple[Effect, ...] = ()
+    max_iterations: int = 200
 
     def worlds(self, engine: str = "auto") -> tuple[World, World]:
         """Compile the source and the target."""
@@ -73,7 +75,7 @@ class TransferConfig:
     engine: str = "auto"
     agent: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
     grounding: GARATConfig | GATConfig = dataclasses.field(default_factory=GARATConfig)
-    max_iterations: int = 200  # of training a policy until it solves its world
+    max_iterations: int | None = None  # of training a policy until it solves; None for the pair's
     num_updates: int = 50  # of the action transformer, Desai et al. 2020
     num_retraining: int = 60  # iterations of the agent in the grounded source
     num_target_transitions: int = 5000
@@ -156,7 +158,7 @@ class Experiment:
             step,
             self.map(start, _fold(self.keys, stage)),
             world.params,
-            config.max_iterations,
+            config.max_iterations or config.pair.max_iterations,
             world,
         )
 

@@ -1,5 +1,8 @@
 """The pairs differ in what the paper's table says, and in nothing else."""
 
+import json
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -43,6 +46,18 @@ def test_masses_are_the_papers_and_inertia_scales_with_them(name, bodies, light,
         np.testing.assert_allclose(
             target.body_inertia[i], ratio * source.body_inertia[i], rtol=1e-6
         )
+
+
+def test_policies_get_the_iterations_that_most_seeds_needed_in_the_targets():
+    path = Path(__file__).parent.parent / "benchmarks" / "results" / "learning.json"
+    rows = {row["env"]: row for row in json.loads(path.read_text(encoding="utf-8"))["targets"]}
+    for name, pair in PAIRS.items():
+        agent = METHODS["garat"](pair).agent
+        solved = np.asarray(rows[name]["returns"]) >= pair.task.solved_return
+        first = int(np.argmax(np.maximum.accumulate(solved, axis=0).mean(axis=1) > 0.5))
+        needed = rows[name]["steps"][first]
+        assert solved.any(axis=0).mean() > 0.5, name
+        assert pair.max_iterations * agent.num_envs * agent.num_steps >= needed, name
 
 
 def test_a_cheetah_of_14_kg_is_the_tasks():
