@@ -18,9 +18,7 @@ from tests.test_gymnasium import grounded, repaired
 
 with warnings.catch_warnings():  # torch's own deprecations
     warnings.simplefilter("ignore")
-    torch = pytest.importorskip(
-        "torch", reason="torch is not installed; it comes with make peers"
-    )
+    torch = pytest.importorskip("torch", reason="torch is not installed; it comes with make peers")
     from torch import nn
     from torch.distributions.normal import Normal
 

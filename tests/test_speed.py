@@ -84,9 +84,7 @@ def test_brax_goes_on_by_one_epoch_at_a_time_and_ends():
 def gymnax_walk():
     with warnings.catch_warnings():  # gymnax's own deprecations
         warnings.simplefilter("ignore")
-        pytest.importorskip(
-            "gymnax", reason="gymnax is not installed; it comes with make peers"
-        )
+        pytest.importorskip("gymnax", reason="gymnax is not installed; it comes with make peers")
         from benchmarks.speed.gymnax_side import as_gymnax
     return as_gymnax(Walk(), WalkParams(0.1))
 
@@ -112,9 +110,7 @@ def test_gymnax_steps_and_resets_our_environments(gymnax_walk):
 
 @pytest.mark.slow
 def test_rejax_trains_in_our_worlds():
-    pytest.importorskip(
-        "rejax", reason="rejax is not installed; it comes with make peers"
-    )
+    pytest.importorskip("rejax", reason="rejax is not installed; it comes with make peers")
     world = make_world(InvertedPendulum(), engine="mujoco")
     side = jax_peers.rejax_side("inverted_pendulum", world, 1)
     side.run()
