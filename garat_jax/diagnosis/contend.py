@@ -126,7 +126,7 @@ def fit_further(problem: Problem, best: Contender, say: Callable[[str], None]) -
     Beside a large effect, a parameter that matters later explains a small part only.
     """
     columns = columns_of(problem.simulator.slots, best.score.effect).values()
-    further = [j for j in columns if j not in best.score.columns]
+    further = [j for j in columns if j not in best.fit.free]
     if not further:
         return []
     effect = problem.simulator.effects[best.score.effect]
@@ -145,7 +145,7 @@ def complete(problem: Problem, best: Contender, say: Callable[[str], None]) -> C
     """
     for fuller in fit_further(problem, best, say):
         timeless = count_timestep(problem, fuller.fit)
-        further = [j for j in fuller.score.columns if j not in best.score.columns]
+        further = [j for j in fuller.fit.free if j not in best.fit.free]
         nil = [j for j in further if not _is_firm(problem, timeless, j)]
         if not nil:
             return dataclasses.replace(fuller, timeless=timeless)

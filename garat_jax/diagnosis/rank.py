@@ -204,7 +204,7 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         if not chosen:
             break
         steps += chosen
-        added = _completed(problem, [step.contender for step in chosen], say)
+        added = _completed(problem, [step.contender for step in steps], say)
         current = added.fit
         steps[-1] = steps[-1]._replace(fit=current)
         steps, current = prune(problem, steps, current, steps[:-1], say)
@@ -272,7 +272,10 @@ def _first_step(judged: Judged) -> list[Step]:
 
 
 def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:
-    """Return the last contender, with what is left out of the laws of all that were added."""
+    """Return the last contender, with what was left out of the laws of all that were added.
+
+    Of an earlier one it may have been left out for the sake of those that were missing yet.
+    """
     last = added[-1]
     for contender in added:
         last = complete(problem, dataclasses.replace(last, score=contender.score), say)
