@@ -10,7 +10,7 @@ import numpy as np
 from garat_jax.diagnosis.diagnose import thin
 from garat_jax.diagnosis.differences import clear_differences, projected
 from garat_jax.diagnosis.findings import Estimate
-from garat_jax.diagnosis.fit import count_timestep, excited, fit
+from garat_jax.diagnosis.fit import excited, fit
 from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
@@ -20,6 +20,7 @@ from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.suggest import suggest
+from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect, unit_at
 from garat_jax.errors import UserError, choose

@@ -16,7 +16,7 @@ import numpy as np
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.diagnose import UNEXPLAINED, diagnose, split, thin
 from garat_jax.diagnosis.findings import Candidate
-from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording
@@ -25,6 +25,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.diagnosis.segments import Segments, choose_grid
 from garat_jax.diagnosis.simulate import Simulator, Slot
+from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.diagnosis.view import as_effects, repaired
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect

@@ -10,11 +10,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from garat_jax.diagnosis.evidence import Evidence
-from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import EQUIVALENT, VISIBLE, Score, cosine, simpler_law
 from garat_jax.diagnosis.simulate import columns_of
 from garat_jax.diagnosis.starts import Fit
+from garat_jax.diagnosis.timestep import count_timestep
 
 CONTENDERS = 4
 """How many candidates are fitted each round, besides those that are like the first."""

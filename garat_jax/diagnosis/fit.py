@@ -5,7 +5,6 @@ The initial states leave the normal equations by projection (variable projection
 as the cost falls as they promise.
 """
 
-import dataclasses
 from functools import partial
 
 import numpy as np
@@ -66,8 +65,6 @@ FINEST = 0.1
 """Shortest steps of a search, relative to its first."""
 BEATEN = 2.0
 """Cost, relative to another fit's, above which a fit is not worth its last steps."""
-EXTRAPOLATED = 0.1
-"""Share of the shift to a timestep of 0 that is uncertain: it is extrapolated from half of one."""
 
 
 def fit(
@@ -118,7 +115,7 @@ def fit(
         settled = settle(problem, theta, start)
         found, lin, keep = _fit_across_contacts(problem, settled, there, free)
         theta, start, settled = found.theta, found.start, lin._replace(start=found.sensitivity)
-    low, high = _interval(problem, theta, lin, free, keep)
+    low, high = interval(problem, theta, lin, free, keep)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
     return Fit(theta, free, frozen, start, settled.residual, settled.start, low, high)
 
@@ -144,7 +141,7 @@ def _settle_all(problem: Problem, theta, start, lin: Linearisation):
     return start, lin, np.sum(lin.residual[problem.fitted] ** 2) < SAME * before
 
 
-def _wide(problem: Problem, near: Fit, free, relative) -> Linearisation:
+def wide(problem: Problem, near: Fit, free, relative) -> Linearisation:
     """Measure sensitivities over wide steps, initial states settled at both ends of each.
 
     Contacts that open or close a step of the engine earlier change what follows by an amount that
@@ -161,7 +158,7 @@ def _wide(problem: Problem, near: Fit, free, relative) -> Linearisation:
 
 
 def _fit_across_contacts(problem: Problem, near: Fit, differences: Differences, free):
-    """Search if more is left than noise, and take Gauss-Newton steps with `_wide` differences.
+    """Search if more is left than noise, and take Gauss-Newton steps with `wide` differences.
 
     Args:
         problem: What is fitted.
@@ -186,8 +183,8 @@ def _fit_across_contacts(problem: Problem, near: Fit, differences: Differences, 
 
 
 def _wide_step(problem: Problem, near: Fit, free, relative):
-    """Take a Gauss-Newton step with `_wide` differences; see `_fit_across_contacts`."""
-    lin = _wide(problem, near, free, relative)
+    """Take a Gauss-Newton step with `wide` differences; see `_fit_across_contacts`."""
+    lin = wide(problem, near, free, relative)
     change, keep = _parameter_step(problem, near.theta, lin, free, 1e-4)
     theta = near.theta.copy()
     theta[list(free)] += change
@@ -329,63 +326,21 @@ def _parameter_step(problem: Problem, theta, lin: Linearisation, free, damping: 
     return step, keep
 
 
-def _interval(problem: Problem, theta, lin: Linearisation, free, keep):
+def interval(problem: Problem, theta, lin: Linearisation, free, keep):
     """Return 95 % intervals: robust, with blocks of time as the independent units."""
     low, high = np.full(len(free), -np.inf), np.full(len(free), np.inf)
     if not np.any(keep):
         return low, high
-    sensitivity, residual = projected(problem, lin)
-    labels = block_labels(problem)[problem.fitted].ravel()
-    found = regress(sensitivity[:, keep], residual, labels)
-    half = stats.t.ppf(0.975, found.freedom) * np.sqrt(np.diag(found.covariance))
+    covariance, sure = uncertainty(problem, lin, keep)
+    half = sure * np.sqrt(np.diag(covariance))
     centre = theta[np.asarray(free)[keep]]
     low[keep], high[keep] = centre - half, centre + half
     return low, high
 
 
-def count_timestep(problem: Problem, fitted: Fit) -> Fit:
-    """Move the estimates to where a timestep of 0 would have them, and the intervals with them.
-
-    At the model's own timestep a parameter also makes up for the integrator's error, which may be
-    many times the noise. Where halving the timestep does not do what sensitivities promise, as
-    across contacts, estimates stay and their intervals reach as far as the shift.
-    """
-    keep = np.asarray([j not in fitted.frozen for j in fitted.free], bool)
-    if not np.any(keep):
-        return fitted
-    free, theta, start = fitted.free, fitted.theta, fitted.start
-    differences = clear_differences(problem, theta, start, free)
-    lin = differences.linearisation
-    if not np.all(differences.is_clear[keep]):
-        lin = _wide(
-            problem, fitted, free, np.where(differences.is_clear, differences.relative, WIDE)
-        )
-    halved = problem.integrator_error(theta, start, fitted.residual)
-    near = lin._replace(start=fitted.sensitivity)
-    sensitivity, change = projected(problem, near._replace(residual=2.0 * halved))
+def uncertainty(problem: Problem, lin: Linearisation, keep) -> tuple[np.ndarray, float]:
+    """Return the covariance of the excited parameters, and standard deviations in a half-width."""
+    sensitivity, residual = projected(problem, lin)
     labels = block_labels(problem)[problem.fitted].ravel()
-    moved = theta.copy()
-    moved[np.asarray(free)[keep]] += regress(sensitivity[:, keep], change, labels).coefficient
-    slots = [slot.parameter for slot in problem.simulator.slots]
-    moved = np.clip(moved, [p.low for p in slots], [p.high for p in slots])
-    shift = (moved - theta)[list(free)]
-    half = near._replace(residual=fitted.residual + halved)
-    if not _does_as_promised(problem, half, theta, start, free, 0.5 * shift):
-        low, high = _interval(problem, theta, lin, free, keep)
-        low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
-        return dataclasses.replace(fitted, low=low, high=high)
-    timeless = lin._replace(residual=fitted.residual + 2.0 * halved)
-    low, high = _interval(problem, moved, timeless, free, keep)
-    unsure = EXTRAPOLATED * np.abs(shift)
-    return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
-
-
-def _does_as_promised(problem: Problem, half: Linearisation, theta, start, free, shift) -> bool:
-    """Say whether a shift of parameters lowers the cost at half the timestep as it should."""
-    moved = theta.copy()
-    moved[list(free)] += shift
-    there = problem.integrator_error(moved, start, np.zeros_like(half.residual))
-    sensitivity, before = projected(problem, half)
-    _, found = projected(problem, half._replace(residual=there))
-    promised = np.sum(before**2) - np.sum((before + sensitivity @ shift) ** 2)
-    return bool(np.sum(before**2) - np.sum(found**2) >= KEPT_PROMISE * promised)
+    found = regress(sensitivity[:, keep], residual, labels)
+    return found.covariance, float(stats.t.ppf(0.975, found.freedom))

@@ -7,11 +7,11 @@ import numpy as np
 
 from garat_jax.diagnosis.contend import Contender, twins
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
-from garat_jax.diagnosis.fit import count_timestep
 from garat_jax.diagnosis.metric import Metric
 from garat_jax.diagnosis.problem import Problem, block_labels
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
 from garat_jax.diagnosis.starts import Fit
+from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.effects.units import unit_at
 
 SMALLEST_SHARE = 0.05

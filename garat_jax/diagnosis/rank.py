@@ -21,7 +21,7 @@ from garat_jax.diagnosis.contend import (
     with_twins,
 )
 from garat_jax.diagnosis.findings import Candidate, Named
-from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import (
     NO_CERTAIN_LEAD,
     Judged,
@@ -35,6 +35,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.steps import Step, prune, refitted, swap
+from garat_jax.diagnosis.timestep import count_timestep
 
 REFINED_ABOVE = 1.1
 """Multiple of the noise floor above which refinements of the best law are tried."""

@@ -13,7 +13,7 @@ from scipy import stats
 
 from garat_jax.diagnosis.diagnose import make_candidates, split, thin
 from garat_jax.diagnosis.findings import Candidate, Named, Repeated, Sighting
-from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import TOO_CLOSE
 from garat_jax.diagnosis.measurements import Recording
@@ -25,6 +25,7 @@ from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit, settle
+from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
 

@@ -8,7 +8,7 @@ import pytest
 from scipy import signal
 
 from garat_jax.diagnosis.diagnose import make_candidates, split, thin
-from garat_jax.diagnosis.fit import count_timestep, fit
+from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
@@ -17,6 +17,7 @@ from garat_jax.diagnosis.screen import cosine, screen
 from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, metric_spread, signal_noise
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.effects import ActuatorDelay
 from tests import models
 

@@ -1,0 +1,86 @@
+"""The minimum of a cost that contacts make rough, and how sure it is.
+
+Where the cost jumps from one set of parameters to the next, a fit ends in the deepest dip that it
+met. A quadratic through the costs around it (Box and Wilson 1951) is what all of them say.
+"""
+
+import numpy as np
+from scipy import stats
+
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.starts import Fit, follow, follow_each
+
+OFFSETS = (-2.0, -1.5, -1.0, 1.0, 1.5, 2.0)
+"""Where the cost is measured, in half-widths of a 95 % interval; not in the dip itself."""
+WIDENED = 2
+"""How often they are doubled along an axis on which the cost shows no curvature."""
+CURVED = 3.0
+"""Standard errors by which a curvature shows."""
+
+
+def smooth_minimum(
+    problem: Problem, fitted: Fit, columns: np.ndarray, covariance: np.ndarray, sure: float
+) -> tuple[Fit, np.ndarray]:
+    """Move a fit to the minimum of a smooth surface through the costs around it.
+
+    Args:
+        problem: What is fitted.
+        fitted: Where the fit ended.
+        columns: Indices of the parameters that are excited, k of them.
+        covariance: Theirs, as noise alone makes it, [k, k].
+        sure: Half-width of a 95 % interval in standard deviations.
+
+    Returns:
+        The fit there, initial states settled, and how far its parameters may be from there for the
+        roughness, half the width of 95 % intervals, [k].
+    """
+    half = sure * np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(half, half) * sure**2
+    share, ways = np.linalg.eigh(correlation)
+    axes = half[:, None] * ways * np.sqrt(np.maximum(share, 1e-6))
+    for _ in range(WIDENED):
+        move, unsure, is_curved = _minimum(*_around(problem, fitted, columns, axes))
+        if np.all(is_curved):
+            break
+        axes = np.where(is_curved, 1.0, 2.0) * axes
+    else:
+        move, unsure, _ = _minimum(*_around(problem, fitted, columns, axes))
+    theta = fitted.theta.copy()
+    theta[columns] += axes @ move
+    return follow(problem, theta, fitted), np.sqrt(np.sum((axes * unsure) ** 2, axis=1))
+
+
+def _around(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
+    """Return places around a fit, in units of the axes, [n, k], and the costs there, [n]."""
+    steps = np.concatenate([np.outer(OFFSETS, axis) for axis in axes.T])
+    slots = [problem.simulator.slots[j].parameter for j in columns]
+    here = fitted.theta[columns]
+    values = np.clip(here + steps, [p.low for p in slots], [p.high for p in slots])
+    thetas = np.tile(fitted.theta, (len(values), 1))
+    thetas[:, columns] = values
+    costs = [fit.cost[problem.fitted].sum() for fit in follow_each(problem, thetas, fitted)]
+    return np.linalg.solve(axes, (values - here).T).T, np.asarray(costs)
+
+
+def _minimum(at: np.ndarray, costs: np.ndarray):
+    """Return where a quadratic without cross terms is least, in how far that is sure, and if it is.
+
+    Returns:
+        The minimum, [k], no farther than the places are; half the width of its 95 % interval, [k];
+        and whether the curvature along each axis shows, [k] bool.
+    """
+    num, size = len(costs), at.shape[1]
+    design = np.concatenate([np.ones((num, 1)), at, at**2], axis=1)
+    inverse = np.linalg.pinv(design.T @ design)
+    factor = inverse @ (design.T @ costs)
+    freedom = max(num - design.shape[1], 1)
+    variance = np.sum((costs - design @ factor) ** 2) / freedom * inverse
+    slope, bend = factor[1 : 1 + size], factor[1 + size :]
+    of_slope, of_bend = np.split(np.diag(variance)[1:], 2)
+    is_curved = bend > CURVED * np.sqrt(of_bend)
+    farthest = np.max(np.abs(at), axis=0)
+    bend = np.where(is_curved, bend, np.inf)
+    move = np.clip(-0.5 * slope / bend, -farthest, farthest)
+    error = np.sqrt(of_slope / 4.0 + move**2 * of_bend) / bend
+    unsure = stats.t.ppf(0.975, freedom) * error
+    return move, np.where(is_curved, np.minimum(unsure, farthest), farthest), is_curved

@@ -1,0 +1,83 @@
+"""Estimates as a timestep of 0 would have them, and as a smooth cost would across contacts."""
+
+import dataclasses
+
+import numpy as np
+
+from garat_jax.diagnosis.differences import STEP, clear_differences, projected
+from garat_jax.diagnosis.fit import WIDE, interval, uncertainty, wide
+from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels
+from garat_jax.diagnosis.robust import regress
+from garat_jax.diagnosis.starts import KEPT_PROMISE, Fit, follow
+from garat_jax.diagnosis.surface import smooth_minimum
+
+EXTRAPOLATED = 0.1
+"""Share of the shift to a timestep of 0 that is uncertain at least: it is extrapolated from half of
+one. It is as much more as half the shift fails to do what was promised of it."""
+
+
+def count_timestep(problem: Problem, fitted: Fit) -> Fit:
+    """Move the estimates to where a timestep of 0 would have them, and the intervals with them.
+
+    At the model's own timestep a parameter also makes up for the integrator's error, which may be
+    many times the noise. Where halving the timestep does not do what sensitivities promise, as
+    across contacts, estimates stay and their intervals reach as far as the shift. Where contacts
+    make the cost rough, that of a smooth surface counts; see `smooth_minimum`.
+    """
+    keep = np.asarray([j not in fitted.frozen for j in fitted.free], bool)
+    if not np.any(keep):
+        return fitted
+    free, theta, start = fitted.free, fitted.theta, fitted.start
+    differences = clear_differences(problem, theta, start, free)
+    lin = differences.linearisation
+    if not np.all(differences.is_clear[keep]):
+        lin = wide(
+            problem, fitted, free, np.where(differences.is_clear, differences.relative, WIDE)
+        )
+    rough = np.zeros(len(free))
+    if np.any(differences.relative[keep] > STEP):
+        covariance, sure = uncertainty(problem, lin, keep)
+        excited = np.asarray(free)[keep]
+        fitted, rough[keep] = smooth_minimum(problem, fitted, excited, covariance, sure)
+        theta, start = fitted.theta, fitted.start
+        lin = lin._replace(residual=fitted.residual)
+    halved = problem.integrator_error(theta, start, fitted.residual)
+    near = lin._replace(start=fitted.sensitivity)
+    sensitivity, change = projected(problem, near._replace(residual=2.0 * halved))
+    labels = block_labels(problem)[problem.fitted].ravel()
+    moved = theta.copy()
+    moved[np.asarray(free)[keep]] += regress(sensitivity[:, keep], change, labels).coefficient
+    slots = [slot.parameter for slot in problem.simulator.slots]
+    moved = np.clip(moved, [p.low for p in slots], [p.high for p in slots])
+    shift = (moved - theta)[list(free)]
+    kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
+    if kept < KEPT_PROMISE:
+        low, high = _wider(interval(problem, theta, lin, free, keep), rough)
+        low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
+        return dataclasses.replace(fitted, low=low, high=high)
+    timeless = lin._replace(residual=fitted.residual + 2.0 * halved)
+    low, high = _wider(interval(problem, moved, timeless, free, keep), rough)
+    unsure = max(EXTRAPOLATED, 1.0 - kept) * np.abs(shift)
+    return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
+
+
+def _wider(ends: tuple[np.ndarray, np.ndarray], rough: np.ndarray):
+    """Return an interval with a further, independent half-width, [k] each."""
+    low, high = ends
+    centre, half = (low + high) / 2, np.hypot((high - low) / 2, rough)
+    known = np.isfinite(high - low)
+    return np.where(known, centre - half, low), np.where(known, centre + half, high)
+
+
+def _kept_promise(problem: Problem, half: Linearisation, fitted: Fit, shift) -> float:
+    """Return how much of the change that half the timestep makes a shift of parameters undoes.
+
+    Relative to what sensitivities promise; the change is the residual in `half`.
+    """
+    moved = fitted.theta.copy()
+    moved[list(fitted.free)] += shift
+    there = problem.integrator_error(moved, fitted.start, fitted.residual)
+    sensitivity, before = projected(problem, half)
+    _, found = projected(problem, half._replace(residual=there))
+    promised = np.sum(before**2) - np.sum((before + sensitivity @ shift) ** 2)
+    return float((np.sum(before**2) - np.sum(found**2)) / max(promised, 1e-300))

@@ -1,0 +1,73 @@
+"""The minimum of a cost that jumps from one set of parameters to the next."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.fit import fit, uncertainty
+from garat_jax.diagnosis.problem import Problem, linearise
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import Fit, follow, follow_each
+from garat_jax.diagnosis.surface import smooth_minimum
+from garat_jax.effects import ViscousDamping
+from tests.diagnosis.test_fit import make_problem, record
+
+TRUTH = 0.02
+COLUMNS = np.asarray([0])
+
+
+class Jumping:
+    """A simulator whose predictions jump in every segment, elsewhere for other parameters."""
+
+    def __init__(self, smooth: Simulator, size: np.ndarray):
+        self.smooth, self.size = smooth, size
+        self.effects, self.slots, self.base = smooth.effects, smooth.slots, smooth.base
+        self.host = smooth.host
+
+    def predict(self, theta, start, segments) -> np.ndarray:
+        predicted = self.smooth.predict(theta, start, segments)
+        after = np.linspace(0, 1, predicted.shape[2])[:, None]
+        for row, values in zip(predicted, theta, strict=True):
+            for segment, own in enumerate(
+                np.broadcast_to(values, (len(row), np.shape(values)[-1]))
+            ):
+                rng = np.random.default_rng([segment, *own.view(np.uint64)])
+                row[segment] += self.size * rng.normal(size=2) * (after > rng.random())
+        return predicted
+
+
+@pytest.fixture(scope="module")
+def smooth() -> tuple[Problem, Fit, np.ndarray, float]:
+    recordings = [record(np.arange(400) * 0.004, damping=TRUTH, seed=seed) for seed in range(2)]
+    problem = make_problem(recordings, [ViscousDamping("joint/hinge")])
+    found = fit(problem, problem.simulator.base, problem.segments.start, COLUMNS)
+    lin = linearise(problem, found.theta, found.start, COLUMNS, [1e-4], found.sensitivity)
+    return problem, found, *uncertainty(problem, lin, np.asarray([True]))
+
+
+def test_from_anywhere_near_a_smooth_minimum_is_found_and_is_sure(smooth):
+    problem, found, covariance, sure = smooth
+    half = sure * np.sqrt(covariance[0, 0])
+    off = follow(problem, found.theta + 0.8 * half, found)
+    back, rough = smooth_minimum(problem, off, COLUMNS, covariance, sure)
+    assert back.theta[0] == pytest.approx(found.theta[0], abs=0.1 * half)
+    assert rough[0] < 0.2 * half
+
+
+def test_the_deepest_dip_of_a_rough_cost_is_left_for_the_middle_of_all(smooth):
+    problem, found, covariance, sure = smooth
+    half = sure * np.sqrt(covariance[0, 0])
+    size = 0.5 * problem.segments.noise
+    rough = dataclasses.replace(problem, simulator=Jumping(problem.simulator, size))
+    tried = found.theta + half * np.linspace(-2, 2, 41)[:, None]
+    dips = sorted(follow_each(rough, tried, found), key=lambda dip: dip.cost.sum())
+    errors, unsure = [], []
+    for dip in dips[:5]:
+        middle, width = smooth_minimum(rough, dip, COLUMNS, covariance, sure)
+        errors.append((dip.theta[0] - found.theta[0], middle.theta[0] - found.theta[0]))
+        unsure.append(width[0])
+    of_dips, of_middles = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert of_middles < 0.6 * of_dips
+    assert np.median(unsure) > 0.2 * half
+    assert all(abs(error) < 2 * width for (_, error), width in zip(errors, unsure, strict=True))
