@@ -214,6 +214,20 @@ def test_a_set_is_drawn_from_its_seed_and_reads_as_recordings(tmp_path):
 
 
 @pytest.mark.slow
+def test_two_effects_that_hide_each_other_on_held_out_data_are_both_found(tmp_path):
+    """A late motor is most of the gap in what is fitted, gravity in what is held out."""
+    truth = draw(Case("late", "single", ("gravity_scale",), "small", (8, 1)), SCENES, ["pendulum"])
+    paths = generate(truth, SCENES["pendulum"], tmp_path)
+    model = load_model(tmp_path / "pendulum.xml")
+    recordings = read_recordings(model, paths)
+    found = diagnose(model, recordings[:3], recordings[3:])
+    assert [c.effect for c in found.selected] == ["gravity_scale", "actuator_delay"]
+    assert found.selected[0].parameters["scale"].estimate == pytest.approx(
+        truth.secrets[0]["scale"], rel=1e-3
+    )
+
+
+@pytest.mark.slow
 def test_two_effects_of_which_neither_leads_by_itself_are_found_together(tmp_path):
     case = next(c for c in list_cases(0) if c.name == "pair-02-air_drag+load_friction")
     truth = draw(case, SCENES)

@@ -23,6 +23,7 @@ STABLE = 0.8
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
+NO_CERTAIN_GAIN = "the held-out error does not fall for certain"
 RESAMPLES = 500
 
 Judged = list[tuple[Candidate, Contender | None]]
@@ -125,7 +126,7 @@ def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stabil
     if share < SMALLEST_SHARE:
         return f"explains only {100 * share:.1f} % of the residual"
     if gain.low <= 0:
-        return "the held-out error does not fall for certain"
+        return NO_CERTAIN_GAIN
     if lead <= 0:
         return NO_CERTAIN_LEAD
     if stability < STABLE:

@@ -23,6 +23,7 @@ from garat_jax.diagnosis.contend import (
 from garat_jax.diagnosis.findings import Candidate, Named
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import (
+    NO_CERTAIN_GAIN,
     NO_CERTAIN_LEAD,
     Judged,
     estimates,
@@ -198,7 +199,7 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}")
         judged = _round(problem, metric, current, held, floor, say)
-        judged, chosen = _look_ahead(problem, metric, judged, held, say)
+        judged, chosen = _look_ahead(problem, metric, current, judged, held, say)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         contender = judged[0][1] if judged else None
         best = contender.fit if contender is not None else best
@@ -229,16 +230,17 @@ def _round(problem: Problem, metric: Metric, current: Fit, held, floor: Floor, s
     return judge(problem, metric, current, scores, contenders, gap)
 
 
-def _look_ahead(problem: Problem, metric: Metric, judged: Judged, held, say):
-    """Where only its lead keeps the first candidate back, see what each leads to with one more.
+def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, held, say):
+    """Where only another effect may keep the first candidate back, see what each leads to with one.
 
-    Of two effects that are missing, neither explains so much by itself that no third can rival it.
+    Of two effects that are missing, neither explains so much by itself that no third can rival it,
+    and the other may drown what it gains on what is held out.
 
     Returns:
         The candidates, the first of which passes if with another it leads its rivals with another;
         and what is to be added: the first if it passes, with the other if it needs that.
     """
-    if not judged or judged[0][0].why != NO_CERTAIN_LEAD:
+    if not judged or judged[0][0].why not in (NO_CERTAIN_LEAD, NO_CERTAIN_GAIN):
         return judged, _first_step(judged)
     first = judged[0][0]
     rivals = [(c, k) for c, k in judged if k and c.named not in first.indistinguishable_from]
@@ -251,7 +253,8 @@ def _look_ahead(problem: Problem, metric: Metric, judged: Judged, held, say):
         paths.append(Path(candidate, contender, then))
     best = min(paths, key=lambda path: path.fit.cost.sum())
     others = [path.fit for path in paths if not best.is_like(path)]
-    may = best.second and best.candidate.why == NO_CERTAIN_LEAD
+    may = best.second and best.candidate.why in (NO_CERTAIN_LEAD, NO_CERTAIN_GAIN)
+    may = may and held_out_gain(problem, metric, current, best.fit).low > 0
     if not may or not all(leads(problem, best.fit, other) for other in others):
         return judged, []
     why = f"passes every gate together with {best.then[0][0].named}"
