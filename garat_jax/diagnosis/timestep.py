@@ -63,10 +63,12 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
 
 def _wider(ends: tuple[np.ndarray, np.ndarray], rough: np.ndarray):
     """Return an interval with a further, independent half-width, [k] each."""
-    low, high = ends
-    centre, half = (low + high) / 2, np.hypot((high - low) / 2, rough)
-    known = np.isfinite(high - low)
-    return np.where(known, centre - half, low), np.where(known, centre + half, high)
+    low, high = (np.array(end) for end in ends)
+    known = np.isfinite(low) & np.isfinite(high)
+    centre = (low[known] + high[known]) / 2
+    half = np.hypot((high[known] - low[known]) / 2, rough[known])
+    low[known], high[known] = centre - half, centre + half
+    return low, high
 
 
 def _kept_promise(problem: Problem, half: Linearisation, fitted: Fit, shift) -> float:
