@@ -130,7 +130,7 @@ def learn_peer(name: str, config: TRPOConfig, seed: int, steps: int) -> list[flo
     judges = to_gymnasium_vector(world.env, world.params, EPISODES)
     found = []
     for _ in range(POINTS):
-        learner.learn(steps // POINTS, log_interval=None, reset_num_timesteps=False)
+        learner.learn(steps // POINTS, log_interval=steps, reset_num_timesteps=False)
         obs, _ = judges.reset(seed=10_000 + EPISODES * seed)
         alive, total = np.ones(EPISODES, bool), np.zeros(EPISODES)
         while alive.any():

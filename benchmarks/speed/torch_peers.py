@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from gymnasium import make
+from gymnasium.spaces import flatdim
 from sb3_contrib import TRPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
@@ -121,7 +122,7 @@ def make_trpo(
     within its limit, ours within 1.5 times that; the library shrinks steps by 0.8, we by 0.5.
     """
     config = config or TRPOConfig()
-    (num_actions,) = envs.action_space.shape
+    num_actions = flatdim(envs.action_space)
     return TRPO(
         "MlpPolicy",
         envs,

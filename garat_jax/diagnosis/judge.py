@@ -24,6 +24,8 @@ TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
 NO_CERTAIN_GAIN = "the held-out error does not fall for certain"
+ANOTHER_MAY_HELP = (NO_CERTAIN_LEAD, NO_CERTAIN_GAIN)
+"""What may keep a candidate back only because of another effect that is missing, too."""
 RESAMPLES = 500
 
 Judged = list[tuple[Candidate, Contender | None]]

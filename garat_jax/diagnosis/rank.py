@@ -23,8 +23,7 @@ from garat_jax.diagnosis.contend import (
 from garat_jax.diagnosis.findings import Candidate, Named
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import (
-    NO_CERTAIN_GAIN,
-    NO_CERTAIN_LEAD,
+    ANOTHER_MAY_HELP,
     Judged,
     estimates,
     held_out_gain,
@@ -240,7 +239,7 @@ def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, 
         The candidates, the first of which passes if with another it leads its rivals with another;
         and what is to be added: the first if it passes, with the other if it needs that.
     """
-    if not judged or judged[0][0].why not in (NO_CERTAIN_LEAD, NO_CERTAIN_GAIN):
+    if not judged or judged[0][0].why not in ANOTHER_MAY_HELP:
         return judged, _first_step(judged)
     first = judged[0][0]
     rivals = [(c, k) for c, k in judged if k and c.named not in first.indistinguishable_from]
@@ -253,7 +252,7 @@ def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, 
         paths.append(Path(candidate, contender, then))
     best = min(paths, key=lambda path: path.fit.cost.sum())
     others = [path.fit for path in paths if not best.is_like(path)]
-    may = best.second and best.candidate.why in (NO_CERTAIN_LEAD, NO_CERTAIN_GAIN)
+    may = best.second and best.candidate.why in ANOTHER_MAY_HELP
     may = may and held_out_gain(problem, metric, current, best.fit).low > 0
     if not may or not all(leads(problem, best.fit, other) for other in others):
         return judged, []
