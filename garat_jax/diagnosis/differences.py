@@ -16,7 +16,9 @@ ALIKE = 0.8
 """Cosine of a step's change and what the next one adds to it below which contacts make them, not
 the law."""
 ERRATIC = 5.0
-"""Root mean square of a change, relative to its median size, above which few samples make it."""
+"""Norm of a change, relative to its typical size, above which few samples make it."""
+NEGLIGIBLE = 1e-9
+"""Change of a sample, relative to the largest one, that does not count as one."""
 
 
 class Differences(NamedTuple):
@@ -55,7 +57,7 @@ def clear_differences(
     steps = difference_steps(problem, theta, free, relative)
     lin = linearise(problem, theta, start, free, steps, sensitivity)
     last, _ = projected(problem, lin)
-    tried = np.flatnonzero([is_erratic(column) for column in last.T])
+    tried = np.flatnonzero([is_erratic(column, problem.num_signals) for column in last.T])
     alike[tried] = 0.0
     wider = STEP
     last = last * steps
@@ -95,10 +97,22 @@ def difference_steps(problem: Problem, theta: np.ndarray, columns, relative) -> 
     return np.asarray(steps)
 
 
-def is_erratic(change: np.ndarray) -> bool:
-    """Say whether a perturbation, where it acts, changes few of the samples [M] much."""
-    size = np.abs(change[change != 0])
-    return bool(len(size) and ERRATIC * np.median(size) < np.sqrt(np.mean(size**2)))
+def is_erratic(change: np.ndarray, num_signals: int) -> bool:
+    """Say whether few samples make a perturbation's change [M]; a flat array of [.., num_signals].
+
+    Each signal is held against its own median: a joint that moves alone is not erratic.
+    """
+    return bool(ERRATIC * typical_size(change, num_signals) < np.linalg.norm(change))
+
+
+def typical_size(change: np.ndarray, num_signals: int) -> float:
+    """Return the norm that a change [M] has if each sample that changes is its signal's median."""
+    size = np.abs(change).reshape(-1, num_signals)
+    acts = size > NEGLIGIBLE * size.max(initial=0.0)
+    medians = [np.median(column[mask]) if mask.any() else 0.0 for column, mask in zip(
+        size.T, acts.T, strict=True
+    )]  # fmt: skip
+    return float(np.sqrt(np.sum(acts.sum(axis=0) * np.square(medians))))
 
 
 def projected(problem: Problem, lin: Linearisation) -> tuple[np.ndarray, np.ndarray]:

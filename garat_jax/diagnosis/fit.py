@@ -126,7 +126,7 @@ def _differences_there(
     """Return the differences at settled initial states, with steps as before where those do."""
     steps = difference_steps(problem, theta, free, relative)
     there = linearise(problem, theta, start, free, steps, settled.start, settled.residual)
-    if any(is_erratic(column) for column in projected(problem, there)[0].T):
+    if any(is_erratic(c, problem.num_signals) for c in projected(problem, there)[0].T):
         return clear_differences(problem, theta, start, free, settled.start)
     return Differences(relative, np.ones(len(free), bool), there)
 

@@ -86,6 +86,11 @@ class Problem(Generic[AnySimulator]):
         """Seconds of a segment."""
         return self.segments.measured.shape[1] * self.interval
 
+    @property
+    def num_signals(self) -> int:
+        """Return how many signals were measured or estimated at each sample."""
+        return self.segments.measured.shape[2]
+
     def starts(self, effect: int) -> tuple[Mapping[str, float], ...]:
         """Return the sizes at which to try an effect, by parameter: listed ones and suggested."""
         law = self.simulator.effects[effect]

@@ -124,7 +124,7 @@ def _measure(problem: Problem[Simulator], theta: np.ndarray, evidence: Evidence,
 
     rows, trials = firsts(problem, theta, skip)
     changes = change(rows)
-    larger = enlarge(simulator, rows, trials, changes, residual)
+    larger = enlarge(problem, rows, trials, changes, residual)
     if larger:
         found = change([row for row, _ in larger.values()])
         other = cosines(found, changes[:, list(larger)]) < ALIKE

@@ -52,7 +52,8 @@ def _suggestion(effect: Effect, missing: MissingTorque) -> Suggestion | None:
     if element != "joint" or missing.dofs.count(name) != 1:
         return None
     dof = missing.dofs.index(name)
-    return effect.suggested(missing.position[:, dof], _ripples(missing, dof))
+    torque, rests = missing.torque[:, dof], _ripples(missing, dof)
+    return effect.suggested(missing.position[:, dof], torque, rests)
 
 
 def _ripples(m: MissingTorque, dof: int) -> np.ndarray:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.differences import is_erratic
+from garat_jax.diagnosis.differences import is_erratic, typical_size
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.simulate import Simulator, columns_of
 
@@ -118,21 +118,21 @@ def _step_within(simulator: Simulator, column: int, value: float) -> float:
 
 
 def enlarge(
-    simulator: Simulator,
+    problem: Problem[Simulator],
     rows: list[Row],
     trials: list[Trial],
     changes: np.ndarray,
     residual: np.ndarray,
 ) -> dict[int, tuple[Row, Trial]]:
-    """Return larger steps for where a small one changes few samples much and most hardly.
+    """Return larger steps for where a small one changes few samples of a signal much, most hardly.
 
     Contacts that open or close a step of the engine earlier change what follows by an amount that
     does not shrink with the perturbation: divided by a small step it drowns the rest. The new step
-    changes the median sample as much as the residual's is. (Friction changes few samples, too, but
-    the same ones with either step.)
+    changes each signal's median sample about as much as the residual's is. (Friction changes few
+    samples, too, but the same ones with either step.)
 
     Args:
-        simulator: The model with all candidates.
+        problem: What is screened.
         rows: One a trial.
         trials: The candidates at their sizes, in the order of the rows.
         changes: What the rows change, [M, rows].
@@ -141,16 +141,17 @@ def enlarge(
     Returns:
         A row and the trial that starts from it, by the index of those they may replace.
     """
-    wanted = float(np.median(np.abs(residual)))
-    larger = {}
+    num_signals, larger = problem.num_signals, {}
+    wanted = typical_size(residual, num_signals)
     for index, (row, trial) in enumerate(zip(rows, trials, strict=True)):
-        if not trial.is_only or len(row.values) > 1 or not is_erratic(changes[:, index]):
+        change = changes[:, index]
+        if not trial.is_only or len(row.values) > 1 or not is_erratic(change, num_signals):
             continue
-        median = float(np.median(np.abs(changes[:, index])))
-        p = simulator.slots[row.column].parameter
+        size = typical_size(change, num_signals)
+        p = problem.simulator.slots[row.column].parameter
         base = row.values[row.column] - row.step
         room = abs((p.high if row.step > 0 else p.low) - base)
-        times = wanted / median if median > 0 else np.inf
+        times = wanted / size if size > 0 else np.inf
         step = np.sign(row.step) * min(times * abs(row.step), ROOM * room)
         if abs(step) > abs(row.step):
             start = {row.column: base + step}

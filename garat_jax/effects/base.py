@@ -256,17 +256,19 @@ class Effect(abc.ABC):
         return ({first.name: cls.at(host, target)[first.name] + first.scale},)
 
     @classmethod
-    def suggested(cls, position: np.ndarray, torques: np.ndarray) -> Suggestion | None:
+    def suggested(
+        cls, position: np.ndarray, torque: np.ndarray, rests: np.ndarray
+    ) -> Suggestion | None:
         """Return sizes that the torque missing at its joint suggests, None if there are none.
 
         For laws with so many shapes that `starts` cannot list them.
 
         Args:
             position: Where the joint was measured, [M].
-            torques: What the model lacks there, less what other laws may explain, in some ways,
-                [K, M].
+            torque: What the model lacks there, [M].
+            rests: The same less what other laws may explain, in some ways, [K, M].
         """
-        del position, torques
+        del position, torque, rests
         return None
 
     @classmethod

@@ -23,6 +23,8 @@ FINER = 4
 """Points of the spectrum for each that the range of the angle resolves."""
 SMOOTH = 3
 """Degree of the polynomial of the angle that stands for other laws beside a ripple."""
+NEAR = 0.1
+"""Distance from a line, relative to the median, beyond which it counts by its size, not square."""
 PEAKS = 2
 """Ripples that each torque suggests: noise of fast motion may stand out more than a small one."""
 
@@ -135,6 +137,24 @@ class JointStiffness(Effect):
             return False
         return not np.any(host.jnt_stiffnesspoly[element_id(host, "joint", name)])
 
+    @classmethod
+    def suggested(
+        cls, position: np.ndarray, torque: np.ndarray, rests: np.ndarray
+    ) -> Suggestion | None:
+        """Return the spring that the missing torque follows most of the time.
+
+        Least absolute deviations: what noise makes of contacts are few torques, but huge ones. Far
+        from its reference a spring is a constant torque first, which a small step at a reference
+        of 0 does not show.
+        """
+        del rests
+        slope, level = _line(position, torque)
+        stiffness, reference = cls.parameters()
+        if not 0.0 < -slope <= stiffness.high:
+            return None
+        middle = float(np.clip(-level / slope, reference.low, reference.high))
+        return Suggestion(({"stiffness": -slope, "reference": middle},), 1)
+
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Put both springs into one."""
         joint = element_id(model.host, "joint", self.name)
@@ -218,19 +238,22 @@ class CoggingTorque(Effect):
         )
 
     @classmethod
-    def suggested(cls, position: np.ndarray, torques: np.ndarray) -> Suggestion | None:
+    def suggested(
+        cls, position: np.ndarray, torque: np.ndarray, rests: np.ndarray
+    ) -> Suggestion | None:
         """Return the ripples that stand out of the missing torques' spectra over the angle.
 
         Each is taken away before the next is looked for, or that were its sidelobe (Högbom 1974).
         Slower ripples than two periods in the range of the angle are hard to tell from other laws.
         """
+        del torque
         span = float(np.ptp(position))
         amplitude, periods, _ = cls.parameters()
         low, high = max(periods.low, 4 * np.pi / max(span, 1e-9)), periods.high
         if low >= high:
             return None
         starts = []
-        for rest in torques:
+        for rest in rests:
             for _ in range(PEAKS):
                 peak = _highest_peak(position, rest, low, high)
                 if peak is None:
@@ -239,7 +262,7 @@ class CoggingTorque(Effect):
                 rest = rest - size * np.sin(peak * position + phase)
                 size = min(size, amplitude.high)
                 starts.append({"amplitude": size, "periods": peak, "phase": phase})
-        num_tried = len(torques) * math.ceil((high - low) * span / (2 * np.pi))
+        num_tried = len(rests) * math.ceil((high - low) * span / (2 * np.pi))
         return Suggestion(tuple(starts), num_tried)
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
@@ -248,6 +271,21 @@ class CoggingTorque(Effect):
         angle = state.qpos[model.host.jnt_qposadr[joint]]
         torque = self.amplitude * jnp.sin(self.periods * angle + self.phase)
         return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
+
+
+def _line(position: np.ndarray, torque: np.ndarray) -> tuple[float, float]:
+    """Return slope and level of the line that is nearest to most of the torques."""
+    middle, level = np.median(position), np.median(torque)
+    spread = float(np.std(position)) + 1e-12
+    size = float(np.median(np.abs(torque - level))) + 1e-12
+    at, wanted = (position - middle) / spread, (torque - level) / size
+
+    def rest(line: np.ndarray) -> np.ndarray:
+        return line[0] * at + line[1] - wanted
+
+    nearest = optimize.least_squares(rest, np.zeros(2), loss="soft_l1", f_scale=NEAR).x
+    slope = float(nearest[0] * size / spread)
+    return slope, float(level + nearest[1] * size) - slope * float(middle)
 
 
 def _highest_peak(position: np.ndarray, torque: np.ndarray, low: float, high: float):

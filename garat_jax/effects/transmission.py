@@ -350,9 +350,11 @@ class Backlash(Transmission):
         return tuple({"gap": gap} for gap in (0.003, 0.015, 0.06))
 
     @classmethod
-    def suggested(cls, position: np.ndarray, torques: np.ndarray) -> Suggestion | None:
+    def suggested(
+        cls, position: np.ndarray, torque: np.ndarray, rests: np.ndarray
+    ) -> Suggestion | None:
         """Try parts of the joint's travel: a gap beyond it is never crossed, and a slide has m."""
-        del torques
+        del torque, rests
         travel, most = float(np.ptp(position)), cls.parameters()[0].high
         gaps = [part * travel for part in PARTS_OF_TRAVEL if 0 < part * travel < most]
         return Suggestion(tuple({"gap": gap} for gap in gaps), len(gaps))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis.contend import Contender, fit_further
-from garat_jax.diagnosis.differences import is_erratic
+from garat_jax.diagnosis.differences import is_erratic, typical_size
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem, linearise
@@ -78,9 +78,17 @@ def test_a_change_of_few_samples_is_erratic():
     smooth = np.sin(np.arange(1000.0))
     jumps = np.full(1000, 1e-3)
     jumps[::100] = 10.0
-    assert is_erratic(jumps)
-    assert not is_erratic(smooth)
-    assert not is_erratic(np.zeros(10))
+    assert is_erratic(jumps, num_signals=1)
+    assert not is_erratic(smooth, num_signals=1)
+    assert not is_erratic(np.zeros(10), num_signals=1)
+
+
+def test_a_change_of_one_signal_of_many_is_not_erratic():
+    """What one joint of a rig does hardly moves the others, by its coupling or by rounding."""
+    rng = np.random.default_rng(0)
+    change = rng.normal(size=(1000, 16)) * np.array([1.0, 0.3, *[1e-3] * 6, *[1e-13] * 8])
+    assert not is_erratic(change.ravel(), num_signals=16)
+    assert typical_size(change.ravel(), 16) == pytest.approx(0.67 * np.linalg.norm(change), rel=0.1)
 
 
 def test_parameters_that_screening_left_out_are_fitted_with_the_best_contender():

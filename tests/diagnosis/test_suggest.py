@@ -5,7 +5,7 @@ import pytest
 
 from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.suggest import suggest
-from garat_jax.effects import CoggingTorque, ViscousDamping
+from garat_jax.effects import CoggingTorque, JointStiffness, ViscousDamping
 from tests.diagnosis.pendulum import MODEL, add_damping, record
 
 HOST = MODEL.spec.copy().compile()
@@ -17,7 +17,7 @@ def test_any_number_of_periods_stands_out_of_the_spectrum(periods):
     rng = np.random.default_rng(0)
     angle = np.concatenate([np.linspace(-2, 3, 3000), 3 - 4 * np.linspace(0, 1, 2000) ** 2])
     torque = 0.3 * np.sin(periods * angle - 1.2) + 0.3 * rng.normal(size=len(angle))
-    start = CoggingTorque.suggested(angle, torque[None]).starts[0]
+    start = CoggingTorque.suggested(angle, torque, torque[None]).starts[0]
     assert start["periods"] == pytest.approx(periods, abs=0.15)
     assert start["amplitude"] == pytest.approx(0.3, rel=0.15)
     wave = np.sin(start["periods"] * angle + start["phase"])
@@ -27,7 +27,7 @@ def test_any_number_of_periods_stands_out_of_the_spectrum(periods):
 def test_a_second_ripple_stands_out_before_the_sidelobes_of_the_first():
     angle = 2.0 * np.sin(np.linspace(0, 20, 8000))
     torque = 0.1 * np.sin(6 * angle) + 0.02 * np.sin(42 * angle + 0.3)
-    first, second = CoggingTorque.suggested(angle, torque[None]).starts
+    first, second = CoggingTorque.suggested(angle, torque, torque[None]).starts
     assert (first["periods"], second["periods"]) == pytest.approx((6, 42), abs=0.05)
     assert (first["amplitude"], second["amplitude"]) == pytest.approx((0.1, 0.02), rel=0.05)
 
@@ -35,7 +35,7 @@ def test_a_second_ripple_stands_out_before_the_sidelobes_of_the_first():
 def test_what_is_left_of_slower_laws_does_not_hide_a_ripple():
     angle = np.linspace(-1, 1, 4000)
     torque = 0.2 * angle**3 + 0.02 * np.sin(17 * angle)
-    starts = CoggingTorque.suggested(angle, torque[None]).starts
+    starts = CoggingTorque.suggested(angle, torque, torque[None]).starts
     assert min(abs(start["periods"] - 17) for start in starts) < 0.3
 
 
@@ -57,8 +57,8 @@ def test_a_controller_that_fights_the_ripple_does_not_hide_it():
 
 def test_a_joint_that_hardly_moves_suggests_nothing():
     still = 1.0 + 1e-3 * np.sin(np.arange(1000.0))
-    assert CoggingTorque.suggested(still, np.sin(100 * still)[None]) is None
-    assert CoggingTorque.suggested(np.full(10, 0.3), np.ones((1, 10))) is None
+    assert CoggingTorque.suggested(still, still, np.sin(100 * still)[None]) is None
+    assert CoggingTorque.suggested(np.full(10, 0.3), np.ones(10), np.ones((1, 10))) is None
 
 
 def test_a_ripple_is_suggested_beside_friction_and_only_to_the_law_that_asks():
@@ -81,3 +81,18 @@ def test_a_ripple_with_an_uncommon_number_of_periods_is_found():
     assert ripple.effect == "cogging_torque"
     assert ripple.parameters["periods"].estimate == pytest.approx(17, rel=0.01)
     assert ripple.parameters["amplitude"].estimate == pytest.approx(0.1, rel=0.05)
+
+
+def test_a_spring_is_suggested_however_contacts_spoil_some_torques():
+    rng = np.random.default_rng(1)
+    angle = np.sin(np.linspace(0, 30, 3000)) - 0.8
+    torque = -2.5 * (angle - 0.4) + 0.3 * rng.normal(size=3000)
+    torque[::7] += 500.0 * rng.normal(size=len(torque[::7])) + 100.0
+    (start,) = JointStiffness.suggested(angle, torque, torque[None]).starts
+    assert (start["stiffness"], start["reference"]) == pytest.approx((2.5, 0.4), rel=0.1)
+
+
+def test_a_torque_that_pushes_away_suggests_no_spring():
+    angle = np.sin(np.linspace(0, 30, 3000))
+    assert JointStiffness.suggested(angle, 0.5 * angle, angle[None]) is None
+    assert JointStiffness.suggested(np.full(9, 0.3), np.ones(9), np.ones((1, 9))) is None

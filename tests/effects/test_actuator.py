@@ -159,10 +159,10 @@ def test_dead_bands_are_suggested_within_the_commands():
 
 def test_play_is_suggested_within_the_travel():
     travel = 0.004 * np.sin(np.arange(1000.0))
-    gaps = [s["gap"] for s in Backlash.suggested(travel, travel).starts]
+    gaps = [s["gap"] for s in Backlash.suggested(travel, travel, travel[None]).starts]
     assert len(gaps) == 2
     assert all(0 < gap < 0.004 for gap in gaps)
-    assert Backlash.suggested(np.full(9, 0.3), np.zeros(9)).starts == ()
+    assert Backlash.suggested(np.full(9, 0.3), np.zeros(9), np.zeros((1, 9))).starts == ()
 
 
 @pytest.mark.parametrize(
