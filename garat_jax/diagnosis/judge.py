@@ -43,8 +43,9 @@ def judge(
         penalty = [len(c.score.columns) * np.log(num_blocks) / num_blocks for c in contenders]
         criterion = np.log(costs.sum(axis=1)) + penalty
         drawn = np.log(_resamples(num_blocks) @ costs.T) + penalty
-        for index in np.argsort(criterion):
-            judged.append(_judge_one(problem, metric, current, contenders, int(index), drawn))
+        alike = _alike(problem, current, contenders, costs, drawn)
+        for index in _simplest_first(problem, contenders, costs, np.argsort(criterion), alike):
+            judged.append(_judge_one(problem, metric, current, contenders, index, alike, drawn))
         judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
         if judged[0][0].passes:
             judged = _with_timestep(problem, metric, judged)
@@ -75,31 +76,48 @@ def _with_timestep(problem: Problem, metric: Metric, judged):
     return judged
 
 
-def _alike(contenders: list[Contender], current: Fit, drawn: np.ndarray, index: int) -> list[int]:
-    """Return the contenders that these recordings cannot tell from one of them."""
+def _alike(problem: Problem, current: Fit, contenders, costs: np.ndarray, drawn: np.ndarray):
+    """List for each contender those that these recordings cannot tell from it.
+
+    They do much the same, and neither leads for certain or both leave no more than noise: what the
+    one explains beyond that is noise, or the integrator's error.
+    """
     change = [(c.fit.residual - current.residual).ravel() for c in contenders]
     size = [float(np.linalg.norm(c)) or 1.0 for c in change]
-    alike = []
-    for other in range(len(contenders)):
-        if other == index:
-            continue
-        same = cosine(contenders[index].score, contenders[other].score)
-        same = max(same, abs(float(change[index] @ change[other])) / (size[index] * size[other]))
-        lead = np.quantile(drawn[:, other] - drawn[:, index], [0.025, 0.5, 0.975])
+    near = _is_near_noise(problem, costs)
+
+    def are_alike(one: int, other: int) -> bool:
+        same = cosine(contenders[one].score, contenders[other].score)
+        same = max(same, abs(float(change[one] @ change[other])) / (size[one] * size[other]))
+        lead = np.quantile(drawn[:, other] - drawn[:, one], [0.025, 0.5, 0.975])
         close = lead[0] < 0 < lead[2] or abs(lead[1]) < np.log(TOO_CLOSE)
-        if same > EQUIVALENT and close:
-            alike.append(other)
-    return alike
+        return bool(same > EQUIVALENT and (close or (near[one] and near[other])))
+
+    every = range(len(contenders))
+    return [[j for j in every if j != i and are_alike(i, j)] for i in every]
 
 
-def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, drawn):
-    contender = contenders[index]
-    alike = _alike(contenders, current, drawn, index)
+def _simplest_first(problem: Problem, contenders, costs: np.ndarray, order: np.ndarray, alike):
+    """Put in front what has fewer parameters than the best and also leaves no more than noise."""
+    near, first = _is_near_noise(problem, costs), int(order[0])
+    rivals = [first, *(i for i in alike[first] if near[first] and near[i])]
+    simplest = min(rivals, key=lambda i: len(contenders[i].score.columns))
+    return [simplest, *(int(i) for i in order if i != simplest)]
+
+
+def _is_near_noise(problem: Problem, costs: np.ndarray) -> np.ndarray:
+    """Say which fits' costs [num_fits, num_blocks] are within what noise makes, [num_fits] bool."""
+    return costs.sum(axis=1) <= problem.expected.sum()
+
+
+def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, alike, drawn):
+    contender, alike = contenders[index], alike[index]
     others = [i for i in range(len(contenders)) if i != index and i not in alike]
     stability = float(np.mean(np.isin(drawn.argmin(axis=1), [index, *alike])))
     lead = np.inf
     if others:
-        lead = float(np.quantile(drawn[:, others].min(axis=1) - drawn[:, index], 0.025))
+        own = drawn[:, [index, *alike]].min(axis=1)
+        lead = float(np.quantile(drawn[:, others].min(axis=1) - own, 0.025))
     gain = held_out_gain(problem, metric, current, contender.fit)
     share = 1.0 - contender.fit.cost[problem.fitted].sum() / current.cost[problem.fitted].sum()
     why = _failed_gate(contender.score, share, gain, lead, stability)

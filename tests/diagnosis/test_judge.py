@@ -1,0 +1,64 @@
+"""Which of several candidates counts, by what each leaves."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.contend import Contender
+from garat_jax.diagnosis.judge import judge
+from garat_jax.diagnosis.metric import make_metric
+from garat_jax.diagnosis.screen import Score
+from garat_jax.diagnosis.starts import settle
+from garat_jax.effects import CoggingTorque, GravityScale
+from tests.diagnosis.test_fit import make_problem, record
+
+TIME = np.arange(800) / 200.0
+SIMPLE, RICH = "gravity_scale", "cogging_torque"
+
+
+@pytest.fixture(scope="module")
+def problem():
+    effects = [CoggingTorque("joint/hinge"), GravityScale("world")]
+    problem = make_problem([record(TIME), record(TIME)], effects)
+    fitted = np.arange(len(problem.fitted)) < len(problem.fitted) // 2
+    return dataclasses.replace(problem, fitted=fitted)
+
+
+def judged(problem, left_by_rich: float, left_by_simple: float):
+    """Judge two laws that do much the same to a large residual, and leave some of the noise."""
+    start = settle(problem, problem.simulator.base, problem.segments.start)
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=start.residual.shape)
+    noise *= np.sqrt(problem.expected.sum() / np.sum(noise**2))
+    wave = 10.0 * np.sin(np.arange(noise.size)).reshape(noise.shape)
+    current = dataclasses.replace(start, residual=noise + wave)
+
+    def contender(effect: int, columns, left: float) -> Contender:
+        size = tuple(0.1 for _ in columns)
+        score = Score(effect, columns, size, {}, 0.9, 1e-9, True, wave.ravel())
+        nothing = np.full(len(columns), np.nan)
+        fit = dataclasses.replace(
+            current, free=columns, residual=left * noise, low=nothing, high=nothing
+        )
+        return Contender(score, fit)
+
+    rich, simple = contender(0, (0, 1, 2), left_by_rich), contender(1, (3,), left_by_simple)
+    metric = make_metric(problem)
+    scores = [rich.score, simple.score]
+    found = judge(problem, metric, current, scores, [rich, simple], gap=True)
+    return [candidate for candidate, _ in found]
+
+
+def test_of_laws_that_both_reach_the_noise_the_simpler_counts(problem):
+    first, second = judged(problem, 0.7, 0.8)
+    assert (first.effect, second.effect) == (SIMPLE, RICH)
+    assert [named.effect for named in first.indistinguishable_from] == [RICH]
+    assert first.passes
+
+
+def test_a_richer_law_counts_where_the_simpler_leaves_more_than_noise(problem):
+    first, second = judged(problem, 1.0, 1.2)
+    assert (first.effect, second.effect) == (RICH, SIMPLE)
+    assert first.indistinguishable_from == ()
+    assert first.passes and not second.passes
