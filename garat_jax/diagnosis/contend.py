@@ -211,19 +211,31 @@ def twins(problem: Problem, score: Score, others: Sequence[Score]) -> list[Score
 
 def _renamed(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender | None:
     """Return a contender's fit under another name; None if that predicts something else."""
-    slots, old = problem.simulator.slots, list(twin.score.columns)
-    names = columns_of(slots, score.effect)
-    new = {j: names[slots[j].parameter.name] for j in old}
-    theta = np.array(twin.fit.theta)
-    theta[old] = current.theta[old]
-    theta[list(new.values())] = twin.fit.theta[old]
-    predicted = problem.simulator.predict(theta[None], twin.fit.start[None], problem.segments)
-    if not np.allclose(problem.whiten(predicted)[0], twin.fit.residual, atol=1e-6):
+    names = columns_of(problem.simulator.slots, score.effect)
+    columns = tuple(names[problem.simulator.slots[j].parameter.name] for j in twin.score.columns)
+    fitted = renamed(twin.fit, current.theta, twin.score.columns, columns)
+    predicted = problem.simulator.predict(fitted.theta[None], fitted.start[None], problem.segments)
+    if not np.allclose(problem.whiten(predicted)[0], fitted.residual, atol=1e-6):
         return None
-    free = tuple(new.get(j, j) for j in twin.fit.free)
-    frozen = tuple(new.get(j, j) for j in twin.fit.frozen)
-    fitted = dataclasses.replace(twin.fit, theta=theta, free=free, frozen=frozen)
-    return Contender(dataclasses.replace(score, columns=tuple(new.values())), fitted)
+    return Contender(dataclasses.replace(score, columns=columns), fitted)
+
+
+def renamed(fitted: Fit, none: np.ndarray, old: Sequence[int], new: Sequence[int]) -> Fit:
+    """Return a fit in which other parameters have the values of some.
+
+    Args:
+        fitted: The fit; its residual stays the very array.
+        none: Parameters with which those named before do nothing, [num_parameters].
+        old: Indices of the parameters as they are named in the fit.
+        new: Their indices as they are to be named.
+    """
+    theta, names = fitted.theta.copy(), dict(zip(old, new, strict=True))
+    theta[list(old)] = none[list(old)]
+    theta[list(new)] = fitted.theta[list(old)]
+    free, frozen = (
+        tuple(names.get(j, j) for j in columns) for columns in (fitted.free, fitted.frozen)
+    )
+    return dataclasses.replace(fitted, theta=theta, free=free, frozen=frozen)
 
 
 def with_evidence(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, twins
+from garat_jax.diagnosis.contend import Contender, renamed, twins
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.metric import Metric
 from garat_jax.diagnosis.problem import Problem, block_labels
@@ -48,7 +48,7 @@ def judge(
             judged.append(_judge_one(problem, metric, current, contenders, index, alike, drawn))
         judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
         if judged[0][0].passes:
-            judged = _with_timestep(problem, metric, judged)
+            judged = _with_timestep(problem, metric, current, judged)
     fitted = [c.score.effect for c in contenders]
     near = "the model's error is near the noise floor" if not gap else "others explain more"
     rest = [score for score in scores if score.effect not in fitted]
@@ -58,21 +58,30 @@ def judge(
     return judged
 
 
-def _with_timestep(problem: Problem, metric: Metric, judged):
+def _with_timestep(problem: Problem, metric: Metric, current: Fit, judged):
     """Show the first candidate, and those like it, as a timestep of 0 would have them.
 
-    Candidates are held against each other, and added to, as they fit at the model's own.
+    Candidates are held against each other, and added to, as they fit at the model's own. What is
+    one fit under two names is counted once.
     """
     shown = {judged[0][0].named, *judged[0][0].indistinguishable_from}
+    counted: list[tuple[Contender, Fit]] = []
     for place, (candidate, contender) in enumerate(judged):
-        if candidate.named in shown:
+        if candidate.named not in shown:
+            continue
+        same = [(c, f) for c, f in counted if c.fit.residual is contender.fit.residual]
+        if same:
+            twin, fit = same[0]
+            fit = renamed(fit, current.theta, twin.score.columns, contender.score.columns)
+        else:
             fit = count_timestep(problem, contender.fit)
-            candidate = dataclasses.replace(
-                candidate,
-                parameters=estimates(problem, contender.score.effect, fit),
-                error_after=metric.error(fit.residual, ~problem.fitted),
-            )
-            judged[place] = (candidate, dataclasses.replace(contender, timeless=fit))
+        candidate = dataclasses.replace(
+            candidate,
+            parameters=estimates(problem, contender.score.effect, fit),
+            error_after=metric.error(fit.residual, ~problem.fitted),
+        )
+        counted.append((contender, fit))
+        judged[place] = (candidate, dataclasses.replace(contender, timeless=fit))
     return judged
 
 

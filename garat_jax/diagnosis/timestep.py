@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from garat_jax.diagnosis.differences import STEP, clear_differences, projected
-from garat_jax.diagnosis.fit import WIDE, interval, uncertainty, wide
+from garat_jax.diagnosis.fit import WIDE, fit, interval, uncertainty, wide
 from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels
 from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.starts import KEPT_PROMISE, Fit, follow
@@ -15,14 +15,18 @@ EXTRAPOLATED = 0.1
 """Share of the shift to a timestep of 0 that is uncertain at least: it is extrapolated from half of
 one. It is as much more as half the shift fails to do what was promised of it."""
 
+REFITTED = 24
+"""Segments that are fitted again at least, at both timesteps."""
+
 
 def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     """Move the estimates to where a timestep of 0 would have them, and the intervals with them.
 
     At the model's own timestep a parameter also makes up for the integrator's error, which may be
     many times the noise. Where halving the timestep does not do what sensitivities promise, as
-    across contacts, estimates stay and their intervals reach as far as the shift. Where contacts
-    make the cost rough, that of a smooth surface counts; see `smooth_minimum`.
+    across contacts, estimates stay, a fit at half the timestep says how far they are from those at
+    0, and their intervals reach as far. Where contacts make the cost rough, that of a smooth
+    surface counts; see `smooth_minimum`.
     """
     keep = np.asarray([j not in fitted.frozen for j in fitted.free], bool)
     if not np.any(keep):
@@ -53,12 +57,30 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
     if kept < KEPT_PROMISE:
         low, high = _wider(interval(problem, theta, lin, free, keep), rough)
+        shift = _shift_by_fits(problem, fitted)
         low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
         return dataclasses.replace(fitted, low=low, high=high)
     timeless = lin._replace(residual=fitted.residual + 2.0 * halved)
     low, high = _wider(interval(problem, moved, timeless, free, keep), rough)
     unsure = max(EXTRAPOLATED, 1.0 - kept) * np.abs(shift)
     return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
+
+
+def _shift_by_fits(problem: Problem, near: Fit) -> np.ndarray:
+    """Return how far a timestep of 0 moves the free parameters, by fits at the whole and at half.
+
+    Some segments say it, `REFITTED` or more, evenly chosen.
+    """
+    chosen = np.flatnonzero(problem.fitted)
+    chosen = chosen[:: max(1, len(chosen) // REFITTED)]
+    problem, near = problem.take(chosen), near.take(chosen)
+
+    def fitted_by(simulator) -> np.ndarray:
+        there = dataclasses.replace(problem, simulator=simulator)
+        return fit(there, near.theta, near.start, near.free, sensitivity=near.sensitivity).theta
+
+    shift = 2.0 * (fitted_by(problem.finer) - fitted_by(problem.simulator))
+    return shift[list(near.free)]
 
 
 def _wider(ends: tuple[np.ndarray, np.ndarray], rough: np.ndarray):
