@@ -108,7 +108,7 @@ def fit_refinements(
         law = effects[score.effect]
         if law.target != simple.target or simple.kind not in law.refines:
             continue
-        has_threshold = len(law.starts(problem.simulator.host, law.target)) > 1
+        has_threshold = problem.num_listed(score.effect) > 1
         if hidden_only and not has_threshold:
             continue
         alike = type(law).refined_from(found)
@@ -191,9 +191,9 @@ def with_twins(
     found = []
     for contender in contenders:
         for score in twins(problem, screened[contender.score.effect], others):
-            renamed = _renamed(problem, current, contender, score)
+            same = _as_twin(problem, current, contender, score)
             rival = contender.fit.cost[problem.fitted].sum()
-            found.append(renamed or _fit(problem, current, score, rival, say))
+            found.append(same or _fit(problem, current, score, rival, say))
     return [*contenders, *found]
 
 
@@ -209,28 +209,28 @@ def twins(problem: Problem, score: Score, others: Sequence[Score]) -> list[Score
     return [s for s in same if np.allclose(s.size, score.size)]
 
 
-def _renamed(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender | None:
+def _as_twin(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender | None:
     """Return a contender's fit under another name; None if that predicts something else."""
     names = columns_of(problem.simulator.slots, score.effect)
     columns = tuple(names[problem.simulator.slots[j].parameter.name] for j in twin.score.columns)
-    fitted = renamed(twin.fit, current.theta, twin.score.columns, columns)
+    fitted = renamed(twin.fit, twin.score.columns, columns, without=current.theta)
     predicted = problem.simulator.predict(fitted.theta[None], fitted.start[None], problem.segments)
     if not np.allclose(problem.whiten(predicted)[0], fitted.residual, atol=1e-6):
         return None
     return Contender(dataclasses.replace(score, columns=columns), fitted)
 
 
-def renamed(fitted: Fit, none: np.ndarray, old: Sequence[int], new: Sequence[int]) -> Fit:
-    """Return a fit in which other parameters have the values of some.
+def renamed(fitted: Fit, old: Sequence[int], new: Sequence[int], without: np.ndarray) -> Fit:
+    """Return a fit whose parameters `old` are called `new`; its residual stays the very array.
 
     Args:
-        fitted: The fit; its residual stays the very array.
-        none: Parameters with which those named before do nothing, [num_parameters].
-        old: Indices of the parameters as they are named in the fit.
-        new: Their indices as they are to be named.
+        fitted: The fit.
+        old: Indices of some parameters.
+        new: Those that get their values.
+        without: Values at which the old ones do nothing, [num_parameters].
     """
     theta, names = fitted.theta.copy(), dict(zip(old, new, strict=True))
-    theta[list(old)] = none[list(old)]
+    theta[list(old)] = without[list(old)]
     theta[list(new)] = fitted.theta[list(old)]
     free, frozen = (
         tuple(names.get(j, j) for j in columns) for columns in (fitted.free, fitted.frozen)

@@ -17,8 +17,6 @@ ALIKE = 0.8
 the law."""
 ERRATIC = 5.0
 """Norm of a change, relative to its typical size, above which few samples make it."""
-NEGLIGIBLE = 1e-9
-"""Change of a sample, relative to the largest one, that does not count as one."""
 
 
 class Differences(NamedTuple):
@@ -102,17 +100,16 @@ def is_erratic(change: np.ndarray, num_signals: int) -> bool:
 
     Each signal is held against its own median: a joint that moves alone is not erratic.
     """
-    return bool(ERRATIC * typical_size(change, num_signals) < np.linalg.norm(change))
+    return bool(ERRATIC * typical_size(change, change, num_signals) < np.linalg.norm(change))
 
 
-def typical_size(change: np.ndarray, num_signals: int) -> float:
-    """Return the norm that a change [M] has if each sample that changes is its signal's median."""
-    size = np.abs(change).reshape(-1, num_signals)
-    acts = size > NEGLIGIBLE * size.max(initial=0.0)
-    medians = [np.median(column[mask]) if mask.any() else 0.0 for column, mask in zip(
-        size.T, acts.T, strict=True
-    )]  # fmt: skip
-    return float(np.sqrt(np.sum(acts.sum(axis=0) * np.square(medians))))
+def typical_size(values: np.ndarray, change: np.ndarray, num_signals: int) -> float:
+    """Return the norm of values [M], each at its signal's median, where a change [M] is not 0."""
+    size, acts = (x.reshape(-1, num_signals).T for x in (np.abs(values), change != 0))
+    squares = [
+        at.sum() * np.median(s[at]) ** 2 for s, at in zip(size, acts, strict=True) if at.any()
+    ]
+    return float(np.sqrt(sum(squares)))
 
 
 def projected(problem: Problem, lin: Linearisation) -> tuple[np.ndarray, np.ndarray]:

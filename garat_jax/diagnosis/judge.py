@@ -7,7 +7,7 @@ import numpy as np
 
 from garat_jax.diagnosis.contend import Contender, renamed, twins
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
-from garat_jax.diagnosis.metric import Metric
+from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
 from garat_jax.diagnosis.problem import Problem, block_labels
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
 from garat_jax.diagnosis.starts import Fit
@@ -33,9 +33,27 @@ Judged = list[tuple[Candidate, Contender | None]]
 
 
 def judge(
-    problem, metric: Metric, current: Fit, scores, contenders: list[Contender], gap: bool
+    problem,
+    metric: Metric,
+    current: Fit,
+    scores: Sequence[Score],
+    contenders: Sequence[Contender],
+    floor: Floor,
 ) -> Judged:
-    """Return every score's candidate, with its contender if it was fitted, best first."""
+    """Return every score's candidate, with its contender if it was fitted, best first.
+
+    Of candidates that do much the same, and leave no more than noise and the integrator make, the
+    one with the fewest parameters that passes every gate is the best.
+
+    Args:
+        problem: What is fitted.
+        metric: Of the errors.
+        current: The fit of the effects selected so far.
+        scores: What screening says.
+        contenders: Those that were fitted.
+        floor: The noise floor.
+    """
+    gap = is_above(problem, metric, current, floor)
     judged = []
     if contenders:
         costs = _block_costs(problem, 1.0, [c.fit for c in contenders], slice(None))
@@ -43,17 +61,24 @@ def judge(
         penalty = [len(c.score.columns) * np.log(num_blocks) / num_blocks for c in contenders]
         criterion = np.log(costs.sum(axis=1)) + penalty
         drawn = np.log(_resamples(num_blocks) @ costs.T) + penalty
-        alike = _alike(problem, current, contenders, costs, drawn)
-        for index in _simplest_first(problem, contenders, costs, np.argsort(criterion), alike):
-            judged.append(_judge_one(problem, metric, current, contenders, index, alike, drawn))
+        at_floor = [not is_above(problem, metric, c.fit, floor, AT_FLOOR) for c in contenders]
+        alike = _alike(current, contenders, at_floor, drawn)
+        order = [int(index) for index in np.argsort(criterion)]
+        found = {
+            i: _judge_one(problem, metric, current, contenders, i, alike, drawn) for i in order
+        }
+        near = [i for i in (order[0], *alike[order[0]]) if at_floor[order[0]] and at_floor[i]]
+        passing = [i for i in near if found[i][0].passes]
+        best = min(passing, key=lambda i: len(contenders[i].score.columns), default=order[0])
+        judged = [found[best], *(found[i] for i in order if i != best)]
         judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
         if judged[0][0].passes:
             judged = _with_timestep(problem, metric, current, judged)
     fitted = [c.score.effect for c in contenders]
-    near = "the model's error is near the noise floor" if not gap else "others explain more"
+    why = "the model's error is near the noise floor" if not gap else "others explain more"
     rest = [score for score in scores if score.effect not in fitted]
     for score in rest:
-        sign = "its sign is physically impossible" if not score.possible else near
+        sign = "its sign is physically impossible" if not score.possible else why
         judged.append((_unfitted(problem, score, rest, score.excluded or sign), None))
     return judged
 
@@ -72,7 +97,8 @@ def _with_timestep(problem: Problem, metric: Metric, current: Fit, judged):
         same = [(c, f) for c, f in counted if c.fit.residual is contender.fit.residual]
         if same:
             twin, fit = same[0]
-            fit = renamed(fit, current.theta, twin.score.columns, contender.score.columns)
+            columns = twin.score.columns, contender.score.columns
+            fit = renamed(fit, *columns, without=current.theta)
         else:
             fit = count_timestep(problem, contender.fit)
         candidate = dataclasses.replace(
@@ -85,38 +111,26 @@ def _with_timestep(problem: Problem, metric: Metric, current: Fit, judged):
     return judged
 
 
-def _alike(problem: Problem, current: Fit, contenders, costs: np.ndarray, drawn: np.ndarray):
-    """List for each contender those that these recordings cannot tell from it.
+def _alike(
+    current: Fit, contenders: Sequence[Contender], at_floor: Sequence[bool], drawn: np.ndarray
+) -> list[list[int]]:
+    """List for each contender those that these recordings do not tell from it.
 
-    They do much the same, and neither leads for certain or both leave no more than noise: what the
-    one explains beyond that is noise, or the integrator's error.
+    They do much the same, and neither leads for certain or both leave no more than noise and the
+    integrator make: what the one explains beyond that is not physics.
     """
     change = [(c.fit.residual - current.residual).ravel() for c in contenders]
     size = [float(np.linalg.norm(c)) or 1.0 for c in change]
-    near = _is_near_noise(problem, costs)
 
     def are_alike(one: int, other: int) -> bool:
         same = cosine(contenders[one].score, contenders[other].score)
         same = max(same, abs(float(change[one] @ change[other])) / (size[one] * size[other]))
         lead = np.quantile(drawn[:, other] - drawn[:, one], [0.025, 0.5, 0.975])
         close = lead[0] < 0 < lead[2] or abs(lead[1]) < np.log(TOO_CLOSE)
-        return bool(same > EQUIVALENT and (close or (near[one] and near[other])))
+        return bool(same > EQUIVALENT and (close or (at_floor[one] and at_floor[other])))
 
     every = range(len(contenders))
     return [[j for j in every if j != i and are_alike(i, j)] for i in every]
-
-
-def _simplest_first(problem: Problem, contenders, costs: np.ndarray, order: np.ndarray, alike):
-    """Put in front what has fewer parameters than the best and also leaves no more than noise."""
-    near, first = _is_near_noise(problem, costs), int(order[0])
-    rivals = [first, *(i for i in alike[first] if near[first] and near[i])]
-    simplest = min(rivals, key=lambda i: len(contenders[i].score.columns))
-    return [simplest, *(int(i) for i in order if i != simplest)]
-
-
-def _is_near_noise(problem: Problem, costs: np.ndarray) -> np.ndarray:
-    """Say which fits' costs [num_fits, num_blocks] are within what noise makes, [num_fits] bool."""
-    return costs.sum(axis=1) <= problem.expected.sum()
 
 
 def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, alike, drawn):
@@ -125,8 +139,10 @@ def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, al
     stability = float(np.mean(np.isin(drawn.argmin(axis=1), [index, *alike])))
     lead = np.inf
     if others:
-        own = drawn[:, [index, *alike]].min(axis=1)
-        lead = float(np.quantile(drawn[:, others].min(axis=1) - own, 0.025))
+        rival, group = drawn[:, others].min(axis=1), drawn[:, [index, *alike]].min(axis=1)
+        lead = float(np.quantile(rival - group, 0.025))
+        if np.quantile(rival - drawn[:, index], 0.975) < 0:  # one that is not alike beats it
+            lead = -np.inf
     gain = held_out_gain(problem, metric, current, contender.fit)
     share = 1.0 - contender.fit.cost[problem.fitted].sum() / current.cost[problem.fitted].sum()
     why = _failed_gate(contender.score, share, gain, lead, stability)

@@ -11,6 +11,8 @@ from garat_jax.diagnosis.starts import Fit
 
 ABOVE_FLOOR = 1.5
 """A model is adequate up to this multiple of the noise floor."""
+AT_FLOOR = 1.1
+"""Multiple of the noise floor up to which a fit leaves nothing for another law to explain."""
 TRUSTED = 3.0
 """Standard deviations of noise that the timestep's error may reach before a sample counts less."""
 

@@ -92,16 +92,21 @@ class Problem(Generic[AnySimulator]):
         return self.segments.measured.shape[2]
 
     def starts(self, effect: int) -> tuple[Mapping[str, float], ...]:
-        """Return the sizes at which to try an effect, by parameter: listed ones and suggested."""
+        """Return the sizes at which to try an effect, by parameter: listed ones, then suggested."""
         law = self.simulator.effects[effect]
         listed, suggestion = law.starts(self.simulator.host, law.target), self.suggested.get(effect)
         return listed if suggestion is None else (*listed, *suggestion.starts)
 
+    def num_listed(self, effect: int) -> int:
+        """Return how many sizes at which to try an effect its law lists itself."""
+        law = self.simulator.effects[effect]
+        return len(law.starts(self.simulator.host, law.target))
+
     def num_tried(self, effect: int) -> int:
         """Return how many sizes of an effect were looked at, for the correction of its p-value."""
-        law, suggestion = self.simulator.effects[effect], self.suggested.get(effect)
-        listed = len(law.starts(self.simulator.host, law.target))
-        return listed + (suggestion.num_tried if suggestion is not None else 0)
+        suggestion = self.suggested.get(effect)
+        more = suggestion.num_tried if suggestion is not None else 0
+        return self.num_listed(effect) + more
 
     def take(self, chosen: np.ndarray) -> "Problem[AnySimulator]":
         """Return the problem of some of the segments."""

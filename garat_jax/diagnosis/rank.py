@@ -30,15 +30,21 @@ from garat_jax.diagnosis.judge import (
     judge,
     leads,
 )
-from garat_jax.diagnosis.metric import Floor, Metric, is_above, make_metric, noise_floor, trusted
+from garat_jax.diagnosis.metric import (
+    AT_FLOOR,
+    Floor,
+    Metric,
+    is_above,
+    make_metric,
+    noise_floor,
+    trusted,
+)
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.steps import Step, prune, refitted, swap
 from garat_jax.diagnosis.timestep import count_timestep
 
-REFINED_ABOVE = 1.1
-"""Multiple of the noise floor above which refinements of the best law are tried."""
 RIVALS = 2
 """How many candidates behind the first are followed for one more effect."""
 ROUNDS = 5
@@ -210,7 +216,7 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         steps[-1] = steps[-1]._replace(fit=current)
         steps, current = prune(problem, steps, current, steps[:-1], say)
         floor = noise_floor(problem, metric, current)
-        if is_above(problem, metric, current, floor, REFINED_ABOVE):
+        if is_above(problem, metric, current, floor, AT_FLOOR):
             steps, current = swap(problem, steps, current, say)
             floor = noise_floor(problem, metric, current)
         timeless = added.timeless if current is added.fit else None
@@ -226,7 +232,7 @@ def _round(problem: Problem, metric: Metric, current: Fit, held, floor: Floor, s
     contenders = with_twins(problem, current, scores, contenders, say)
     num_tests = len([score for score in scores if not score.excluded])
     contenders = with_evidence(problem, current, contenders, num_tests)
-    return judge(problem, metric, current, scores, contenders, gap)
+    return judge(problem, metric, current, scores, contenders, floor)
 
 
 def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, held, say):
@@ -300,7 +306,7 @@ def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Fl
         lambda best: fit_further(problem, best, say),
     ):
         best = min(contenders, key=lambda c: c.fit.cost.sum(), default=None)
-        if best is None or not is_above(problem, metric, best.fit, floor, REFINED_ABOVE):
+        if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
             break
         for contender in find(best):
             if leads(problem, contender.fit, best.fit):

@@ -1,9 +1,11 @@
 """Sizes at which to try effects, as recordings and the torque missing in them suggest."""
 
+import functools
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from scipy import optimize
 
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording
@@ -12,6 +14,8 @@ from garat_jax.effects import Effect, Suggestion
 
 REVERSED = 0.05
 """Speed, relative to its root mean square, within which dry friction is smoothed here."""
+NEAR = 0.1
+"""Distance from fitted laws, relative to the torques' median, from which its size counts."""
 
 
 def suggest(
@@ -31,7 +35,8 @@ def suggest(
     if not asked:
         return {}
     missing = missing_torque(host, recordings)
-    answers = {index: _suggestion(effect, missing) for index, effect in asked.items()}
+    torques = functools.cache(lambda dof: (_without_friction(missing, dof), _ripples(missing, dof)))
+    answers = {index: _suggestion(effect, missing, torques) for index, effect in asked.items()}
     return {index: answer for index, answer in answers.items() if answer is not None}
 
 
@@ -43,8 +48,8 @@ def _may_answer(effect: Effect) -> bool:
     )
 
 
-def _suggestion(effect: Effect, missing: MissingTorque) -> Suggestion | None:
-    """Return an effect's suggestion, None if it has none."""
+def _suggestion(effect: Effect, missing: MissingTorque, torques) -> Suggestion | None:
+    """Return an effect's suggestion, None if it has none; `torques` of a dof as `suggested` has."""
     element, _, name = effect.target.partition("/")
     if element == "actuator":
         at = missing.actuators.index(name)
@@ -52,8 +57,34 @@ def _suggestion(effect: Effect, missing: MissingTorque) -> Suggestion | None:
     if element != "joint" or missing.dofs.count(name) != 1:
         return None
     dof = missing.dofs.index(name)
-    torque, rests = missing.torque[:, dof], _ripples(missing, dof)
-    return effect.suggested(missing.position[:, dof], torque, rests)
+    return effect.suggested(missing.position[:, dof], *torques(dof))
+
+
+def _without_friction(m: MissingTorque, dof: int) -> np.ndarray:
+    """Return the torque missing at a dof less what damping and dry friction explain of it, [M].
+
+    They are fitted beside a line over the position, to most of the torques: those of contacts that
+    noise opens and closes are few but huge.
+    """
+    rub = _friction(m, dof)
+    columns = np.stack([np.ones(len(rub)), m.position[:, dof], *rub.T], axis=1)
+    unit = np.linalg.norm(columns, axis=0) / len(rub) ** 0.5 + 1e-12
+    torque = m.torque[:, dof]
+    level = np.median(torque)
+    size = float(np.median(np.abs(torque - level))) + 1e-12
+
+    def rest(factor: np.ndarray) -> np.ndarray:
+        return (columns / unit) @ factor - (torque - level) / size
+
+    found = optimize.least_squares(rest, np.zeros(len(unit)), loss="soft_l1", f_scale=NEAR).x
+    return torque - rub @ (found * size / unit)[2:]
+
+
+def _friction(m: MissingTorque, dof: int) -> np.ndarray:
+    """Return the speed of a dof and the sign of dry friction, smoothed at reversals, [M, 2]."""
+    speed = m.velocity[:, dof]
+    scale = float(np.sqrt(np.mean(speed**2))) + 1e-12
+    return np.stack([speed, np.tanh(speed / (REVERSED * scale))], axis=1)
 
 
 def _ripples(m: MissingTorque, dof: int) -> np.ndarray:
@@ -64,15 +95,8 @@ def _ripples(m: MissingTorque, dof: int) -> np.ndarray:
     acceleration, load and command two will do: with one dof their torques add up to what is
     missing, whatever its law.
     """
-    speed = m.velocity[:, dof]
-    scale = float(np.sqrt(np.mean(speed**2))) + 1e-12
-    laws = [
-        np.ones_like(speed),
-        m.position[:, dof],
-        speed,
-        np.tanh(speed / (REVERSED * scale)),
-        m.load[:, dof],
-    ]
+    rub = _friction(m, dof)
+    laws = [np.ones(len(rub)), m.position[:, dof], *rub.T, m.load[:, dof]]
     torque = m.torque[:, dof][:, None]
     rests = (
         without(torque, orthonormal(np.stack(columns, axis=1)))[:, 0]

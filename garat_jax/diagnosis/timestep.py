@@ -24,8 +24,8 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
 
     At the model's own timestep a parameter also makes up for the integrator's error, which may be
     many times the noise. Where halving the timestep does not do what sensitivities promise, as
-    across contacts, estimates stay, a fit at half the timestep says how far they are from those at
-    0, and their intervals reach as far. Where contacts make the cost rough, that of a smooth
+    across contacts, estimates stay, fits at both timesteps say how far they are from those at 0,
+    and their intervals reach as far. Where contacts make the cost rough, that of a smooth
     surface counts; see `smooth_minimum`.
     """
     keep = np.asarray([j not in fitted.frozen for j in fitted.free], bool)
@@ -51,8 +51,7 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     labels = block_labels(problem)[problem.fitted].ravel()
     moved = theta.copy()
     moved[np.asarray(free)[keep]] += regress(sensitivity[:, keep], change, labels).coefficient
-    slots = [slot.parameter for slot in problem.simulator.slots]
-    moved = np.clip(moved, [p.low for p in slots], [p.high for p in slots])
+    moved = np.clip(moved, *_bounds(problem))
     shift = (moved - theta)[list(free)]
     kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
     if kept < KEPT_PROMISE:
@@ -80,7 +79,14 @@ def _shift_by_fits(problem: Problem, near: Fit) -> np.ndarray:
         return fit(there, near.theta, near.start, near.free, sensitivity=near.sensitivity).theta
 
     shift = 2.0 * (fitted_by(problem.finer) - fitted_by(problem.simulator))
-    return shift[list(near.free)]
+    moved = np.clip(near.theta + shift, *_bounds(problem))
+    return (moved - near.theta)[list(near.free)]
+
+
+def _bounds(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest values of all parameters, [num_parameters] each."""
+    parameters = [slot.parameter for slot in problem.simulator.slots]
+    return np.asarray([p.low for p in parameters]), np.asarray([p.high for p in parameters])
 
 
 def _wider(ends: tuple[np.ndarray, np.ndarray], rough: np.ndarray):

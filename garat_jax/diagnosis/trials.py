@@ -35,7 +35,7 @@ class Trial(NamedTuple):
         effect: Index among the simulator's effects.
         start: What "tried" sets, by column.
         rows: Indices of the rows that move one parameter each, the first parameter's first.
-        is_only: Whether the law is tried at one size; then sizes are extrapolated from it.
+        is_only: Whether it is the one size that the law lists; then sizes are extrapolated from it.
     """
 
     effect: int
@@ -54,14 +54,15 @@ def firsts(problem: Problem[Simulator], theta: np.ndarray, skip) -> tuple[list[R
         columns = list(names.values())
         if index in skip or not columns:
             continue
-        starts = _sizes(problem, theta, index, columns)
-        for given in starts:
+        has_one = problem.num_listed(index) == 1
+        for place, given in enumerate(_sizes(problem, theta, index, columns)):
             start = {names[name]: value for name, value in given.items()}
-            if len(starts) == 1 and len(start) == 1:
+            is_only = has_one and place == 0
+            if is_only and len(start) == 1:
                 step = _step_within(simulator, columns[0], theta[columns[0]])
                 start = {columns[0]: theta[columns[0]] + step}
             moved = next(j for j in columns if j in start)
-            trials.append(Trial(index, start, (len(rows),), len(starts) == 1))
+            trials.append(Trial(index, start, (len(rows),), is_only))
             rows.append(Row(moved, start, start[moved] - theta[moved], -1))
     return rows, trials
 
@@ -74,8 +75,10 @@ def _sizes(problem: Problem[Simulator], theta: np.ndarray, index: int, columns: 
     slots = [simulator.slots[j].parameter for j in columns]
     acts = any(theta[j] != none[p.name] for j, p in zip(columns, slots, strict=True))
     starts = problem.starts(index)
-    if not acts or len(starts) == 1:
+    if not acts:
         return starts
+    if problem.num_listed(index) == 1:
+        return starts[:1]
     first, size = slots[0], float(theta[columns[0]])
     return tuple({first.name: min(factor * size, first.high)} for factor in (0.5, 2.0))
 
@@ -128,8 +131,8 @@ def enlarge(
 
     Contacts that open or close a step of the engine earlier change what follows by an amount that
     does not shrink with the perturbation: divided by a small step it drowns the rest. The new step
-    changes each signal's median sample about as much as the residual's is. (Friction changes few
-    samples, too, but the same ones with either step.)
+    makes the median samples of what it changes as large as the residual's there. (Friction changes
+    few samples, too, but the same ones with either step.)
 
     Args:
         problem: What is screened.
@@ -142,17 +145,15 @@ def enlarge(
         A row and the trial that starts from it, by the index of those they may replace.
     """
     num_signals, larger = problem.num_signals, {}
-    wanted = typical_size(residual, num_signals)
     for index, (row, trial) in enumerate(zip(rows, trials, strict=True)):
         change = changes[:, index]
         if not trial.is_only or len(row.values) > 1 or not is_erratic(change, num_signals):
             continue
-        size = typical_size(change, num_signals)
+        wanted, size = (typical_size(x, change, num_signals) for x in (residual, change))
         p = problem.simulator.slots[row.column].parameter
         base = row.values[row.column] - row.step
         room = abs((p.high if row.step > 0 else p.low) - base)
-        times = wanted / size if size > 0 else np.inf
-        step = np.sign(row.step) * min(times * abs(row.step), ROOM * room)
+        step = np.sign(row.step) * min(wanted / size * abs(row.step), ROOM * room)
         if abs(step) > abs(row.step):
             start = {row.column: base + step}
             larger[index] = Row(row.column, start, step, -1), trial._replace(start=start)

@@ -261,11 +261,11 @@ class Effect(abc.ABC):
     ) -> Suggestion | None:
         """Return sizes that the torque missing at its joint suggests, None if there are none.
 
-        For laws with so many shapes that `starts` cannot list them.
+        For laws whose place or shape `starts` cannot list.
 
         Args:
             position: Where the joint was measured, [M].
-            torque: What the model lacks there, [M].
+            torque: What the model lacks there, less what damping and dry friction explain, [M].
             rests: The same less what other laws may explain, in some ways, [K, M].
         """
         del position, torque, rests

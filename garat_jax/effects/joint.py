@@ -24,7 +24,10 @@ FINER = 4
 SMOOTH = 3
 """Degree of the polynomial of the angle that stands for other laws beside a ripple."""
 NEAR = 0.1
-"""Distance from a line, relative to the median, beyond which it counts by its size, not square."""
+"""Distance from a line, relative to the torques' median, beyond which it counts by its size."""
+CLEAR = 0.1
+"""Torque that a line rises by over the position's spread, relative to the torques' median distance
+from theirs, below which it is lost among them."""
 PEAKS = 2
 """Ripples that each torque suggests: noise of fast motion may stand out more than a small one."""
 
@@ -143,16 +146,18 @@ class JointStiffness(Effect):
     ) -> Suggestion | None:
         """Return the spring that the missing torque follows most of the time.
 
-        Least absolute deviations: what noise makes of contacts are few torques, but huge ones. Far
-        from its reference a spring is a constant torque first, which a small step at a reference
-        of 0 does not show.
+        Far from its reference a spring is a constant torque first, which a small step at a
+        reference of 0 does not show. A slope that is lost in the scatter suggests nothing, nor does
+        one whose torque has no end within the bounds of the reference: that is a constant torque.
         """
         del rests
         slope, level = _line(position, torque)
         stiffness, reference = cls.parameters()
         if not 0.0 < -slope <= stiffness.high:
             return None
-        middle = float(np.clip(-level / slope, reference.low, reference.high))
+        middle = -level / slope
+        if not reference.low < middle < reference.high:
+            return None
         return Suggestion(({"stiffness": -slope, "reference": middle},), 1)
 
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
@@ -274,7 +279,11 @@ class CoggingTorque(Effect):
 
 
 def _line(position: np.ndarray, torque: np.ndarray) -> tuple[float, float]:
-    """Return slope and level of the line that is nearest to most of the torques."""
+    """Return slope and level of the line nearest to most of the torques; 0 if that is not clear.
+
+    Distances count by their size (pseudo-Huber loss): what noise makes of contacts are few torques,
+    but huge ones.
+    """
     middle, level = np.median(position), np.median(torque)
     spread = float(np.std(position)) + 1e-12
     size = float(np.median(np.abs(torque - level))) + 1e-12
@@ -284,7 +293,7 @@ def _line(position: np.ndarray, torque: np.ndarray) -> tuple[float, float]:
         return line[0] * at + line[1] - wanted
 
     nearest = optimize.least_squares(rest, np.zeros(2), loss="soft_l1", f_scale=NEAR).x
-    slope = float(nearest[0] * size / spread)
+    slope = float(nearest[0] * size / spread) if abs(nearest[0]) > CLEAR else 0.0
     return slope, float(level + nearest[1] * size) - slope * float(middle)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.judge import judge
-from garat_jax.diagnosis.metric import make_metric
+from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
 from garat_jax.effects import CoggingTorque, GravityScale
@@ -25,28 +25,29 @@ def problem():
     return dataclasses.replace(problem, fitted=fitted)
 
 
-def judged(problem, left_by_rich: float, left_by_simple: float):
+def judged(problem, left_by_rich: float, left_by_simple: float, p_value: float = 1e-9):
     """Judge two laws that do much the same to a large residual, and leave some of the noise."""
     start = settle(problem, problem.simulator.base, problem.segments.start)
     rng = np.random.default_rng(0)
     noise = rng.normal(size=start.residual.shape)
-    noise *= np.sqrt(problem.expected.sum() / np.sum(noise**2))
     wave = 10.0 * np.sin(np.arange(noise.size)).reshape(noise.shape)
     current = dataclasses.replace(start, residual=noise + wave)
 
-    def contender(effect: int, columns, left: float) -> Contender:
+    def contender(effect: int, columns, left: float, p_value: float) -> Contender:
         size = tuple(0.1 for _ in columns)
-        score = Score(effect, columns, size, {}, 0.9, 1e-9, True, wave.ravel())
+        score = Score(effect, columns, size, {}, 0.9, p_value, True, wave.ravel())
         nothing = np.full(len(columns), np.nan)
         fit = dataclasses.replace(
             current, free=columns, residual=left * noise, low=nothing, high=nothing
         )
         return Contender(score, fit)
 
-    rich, simple = contender(0, (0, 1, 2), left_by_rich), contender(1, (3,), left_by_simple)
+    rich = contender(0, (0, 1, 2), left_by_rich, 1e-9)
+    simple = contender(1, (3,), left_by_simple, p_value)
     metric = make_metric(problem)
+    floor = noise_floor(problem, metric, start)
     scores = [rich.score, simple.score]
-    found = judge(problem, metric, current, scores, [rich, simple], gap=True)
+    found = judge(problem, metric, current, scores, [rich, simple], floor)
     return [candidate for candidate, _ in found]
 
 
@@ -58,7 +59,13 @@ def test_of_laws_that_both_reach_the_noise_the_simpler_counts(problem):
 
 
 def test_a_richer_law_counts_where_the_simpler_leaves_more_than_noise(problem):
-    first, second = judged(problem, 1.0, 1.2)
+    first, second = judged(problem, 0.9, 1.3)
     assert (first.effect, second.effect) == (RICH, SIMPLE)
     assert first.indistinguishable_from == ()
+    assert first.passes and not second.passes
+
+
+def test_a_simpler_law_that_fails_a_gate_does_not_count(problem):
+    first, second = judged(problem, 0.7, 0.8, p_value=0.5)
+    assert (first.effect, second.effect) == (RICH, SIMPLE)
     assert first.passes and not second.passes

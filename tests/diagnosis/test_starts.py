@@ -88,7 +88,14 @@ def test_a_change_of_one_signal_of_many_is_not_erratic():
     rng = np.random.default_rng(0)
     change = rng.normal(size=(1000, 16)) * np.array([1.0, 0.3, *[1e-3] * 6, *[1e-13] * 8])
     assert not is_erratic(change.ravel(), num_signals=16)
-    assert typical_size(change.ravel(), 16) == pytest.approx(0.67 * np.linalg.norm(change), rel=0.1)
+    typical = typical_size(change.ravel(), change.ravel(), 16)
+    assert typical == pytest.approx(0.67 * np.linalg.norm(change), rel=0.1)
+
+
+def test_a_perturbation_after_which_few_samples_diverge_is_erratic():
+    change = np.full((1000, 2), 0.05)
+    change[::200] = 1e8
+    assert is_erratic(change.ravel(), num_signals=2)
 
 
 def test_parameters_that_screening_left_out_are_fitted_with_the_best_contender():

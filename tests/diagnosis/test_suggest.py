@@ -92,7 +92,26 @@ def test_a_spring_is_suggested_however_contacts_spoil_some_torques():
     assert (start["stiffness"], start["reference"]) == pytest.approx((2.5, 0.4), rel=0.1)
 
 
-def test_a_torque_that_pushes_away_suggests_no_spring():
+def test_dry_friction_suggests_no_spring_and_does_not_bend_one():
+    def rubbed(stiffness: float, seed: int):
+        def pull(angle: float) -> float:
+            return -stiffness * (angle - 0.3)
+
+        return record(
+            lambda spec: None, seed, ripple=pull, torque=lambda speed: -0.1 * np.tanh(100 * speed)
+        )
+
+    spring = JointStiffness("joint/hinge")
+    assert suggest([spring], HOST, [rubbed(0.0, seed) for seed in range(3)]) == {}
+    (start,) = suggest([spring], HOST, [rubbed(0.4, seed) for seed in range(3)])[0].starts
+    assert start["stiffness"] == pytest.approx(0.4, rel=0.1)
+    assert start["reference"] == pytest.approx(0.3, abs=0.05)
+
+
+def test_what_is_no_spring_suggests_none():
     angle = np.sin(np.linspace(0, 30, 3000))
+    scatter = 0.3 * np.random.default_rng(2).normal(size=3000)
     assert JointStiffness.suggested(angle, 0.5 * angle, angle[None]) is None
+    assert JointStiffness.suggested(angle, 5.0 + scatter, angle[None]) is None
+    assert JointStiffness.suggested(1e-4 * angle, scatter, angle[None]) is None
     assert JointStiffness.suggested(np.full(9, 0.3), np.ones(9), np.ones((1, 9))) is None

@@ -48,8 +48,8 @@ def test_steps_grow_where_few_samples_make_the_change():
     far, _ = enlarge(problem, rows, trials, changes, np.full(1000, 1e9))[friction]
     assert far.step == pytest.approx(0.3 * (p.high - p.low))
     changes[:, friction] = np.where(np.arange(1000) % 100, 0.0, 1.0)
-    changes[0, friction] = 1e3  # those that change explain the residual of all
-    rare, _ = enlarge(problem, rows, trials, changes, np.full(1000, 0.5))[friction]
+    changes[0, friction] = 1e3  # most samples do not change at all
+    rare, _ = enlarge(problem, rows, trials, changes, np.full(1000, 5.0))[friction]
     assert rare.step == pytest.approx(5 * rows[friction].step)
 
 
