@@ -84,16 +84,13 @@ def diagnose(
     outcome = explain(problem, settled.start, say, lambda p, t: cut_longer(p, everything, grid, t))
     problem = outcome.problem
     error = _errors(problem, outcome, host, how, grid.timestep)
-    verdict = _verdict(outcome, error)
-    stays = verdict == "unexplained" and not error.is_too_coarse
-    left = leftover(problem, outcome.after, everything, host) if stays else ()
-    return Diagnosis(
+    found = Diagnosis(
         model=str(model.path),
         data=tuple(r.name for r in fitted),
         holdout=tuple(r.name for r in held_out),
         versions=versions(),
-        seconds=time.monotonic() - started,
-        verdict=verdict,
+        seconds=0.0,
+        verdict=_verdict(outcome, error),
         error=error,
         where=tuple(localise(missing_torque(host, everything))),
         candidates=outcome.candidates,
@@ -104,8 +101,10 @@ def diagnose(
         warnings=warnings,
         unseen=unseen(problem, outcome.before),
         still=is_still(problem.segments),
-        left=tuple(left),
+        left=(),
     )
+    left = leftover(problem, outcome.after, everything, host) if found.is_left else ()
+    return dataclasses.replace(found, left=tuple(left), seconds=time.monotonic() - started)
 
 
 def split(recordings: Sequence[Recording], holdout: Sequence[Recording]):
