@@ -3,7 +3,8 @@
 `python benchmarks/hidden_effects.py --seed 1` makes the numbers that are reported. Thresholds are
 tuned on seed 0. Rows are appended to OUT/rows.jsonl as they come, so an interrupted run goes on.
 `--sample N` diagnoses the first N sets of a random order; the result says of how many, and a larger
-sample with `--extend` keeps what the result file has. A run of hand-picked cases writes no result.
+sample with `--extend` keeps what the result file has. A set that takes longer than `--limit` counts
+as wrong. A run of hand-picked cases writes no result.
 `--timing` needs `pip install 'mujoco[sysid]'`.
 """
 
@@ -12,6 +13,7 @@ import concurrent.futures
 import json
 import multiprocessing
 import os
+import signal
 import tempfile
 import time
 import traceback
@@ -37,13 +39,19 @@ REPORTING_SEED = 1
 """The seed that is reported; never used to choose a threshold."""
 
 
-def run_case(case: Case, robots: Sequence[str]) -> dict[str, Any]:
-    """Draw, record and diagnose one set; return its row of the table."""
+def run_case(case: Case, robots: Sequence[str], limit: int = 0) -> dict[str, Any]:
+    """Draw, record and diagnose one set, in `limit` seconds if that is not 0; return its row."""
     row: dict[str, Any] = {"case": case.name, "category": case.category, "seed": case.seed[0]}
     lacking = [k for k in case.kinds if case.category != "outside" and k not in CATALOGUE]
     if lacking:
         return row | {"status": score.NOT_YET, "lacking": lacking}
     started = time.monotonic()
+
+    def stop(*_) -> None:
+        raise TimeoutError
+
+    signal.signal(signal.SIGALRM, stop)
+    signal.alarm(limit)
     try:
         scenes = Surveys()
         truth = draw(case, scenes, robots)
@@ -52,8 +60,12 @@ def run_case(case: Case, robots: Sequence[str]) -> dict[str, Any]:
             paths = generate(truth, scenes[truth.robot], Path(folder))
             row["seconds_to_make"] = time.monotonic() - started
             row |= _diagnose(truth, paths)
+    except TimeoutError:
+        row |= {"status": f"error: not ended within {limit} s"}
     except Exception as error:
         row |= {"status": f"error: {error!r}", "traceback": traceback.format_exc(limit=-4)}
+    finally:
+        signal.alarm(0)
     return finite_or_null(to_plain(row))
 
 
@@ -122,6 +134,7 @@ def run(
     jobs: int,
     path: Path,
     recorded: dict[str, dict[str, Any]],
+    limit: int,
 ) -> list[dict[str, Any]]:
     """Run all cases that have no earlier row, append them to a file, and return all rows."""
     commit = (git_state() or {}).get("commit")
@@ -137,11 +150,11 @@ def run(
     with concurrent.futures.ProcessPoolExecutor(
         jobs, context, initializer=_keep_to_own_cores, initargs=(numbers, jobs)
     ) as pool:
-        futures = [pool.submit(run_case, case, robots) for case in todo] if jobs > 1 else []
+        futures = [pool.submit(run_case, case, robots, limit) for case in todo] if jobs > 1 else []
         made = (
             (future.result() for future in concurrent.futures.as_completed(futures))
             if jobs > 1
-            else (run_case(case, robots) for case in todo)
+            else (run_case(case, robots, limit) for case in todo)
         )
         for row in made:
             row["commit"] = commit
@@ -178,6 +191,7 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
     parser.add_argument("--sample", type=int, metavar="N", help="the first N of a random order")
     parser.add_argument("--extend", action="store_true", help="keep the rows of the result file")
+    parser.add_argument("--limit", type=int, default=0, metavar="SECONDS", help="of a set; 0: none")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder of rows.jsonl")
     parser.add_argument("--timing", action="store_true", help="time garat beside mujoco.sysid")
@@ -197,7 +211,7 @@ def main() -> None:
     earlier = recorded_rows(arguments.seed) if arguments.extend else {}
     if beyond := earlier.keys() - {case.name for case in cases}:
         parser.error(f"--extend would drop {len(beyond)} recorded sets; give a larger --sample")
-    rows = run(cases, arguments.robots, arguments.jobs, path, earlier)
+    rows = run(cases, arguments.robots, arguments.jobs, path, earlier, arguments.limit)
     lines = report(rows)
     picked = arguments.only or arguments.robots != list(ROBOTS)
     if not picked and not any(row["status"] == score.NOT_YET for row in rows):

@@ -4,6 +4,8 @@ Where the cost jumps from one set of parameters to the next, a fit ends in the d
 met. A quadratic through the costs around it (Box and Wilson 1951) is what all of them say.
 """
 
+from functools import partial
+
 import numpy as np
 from scipy import stats
 
@@ -34,17 +36,19 @@ def smooth_minimum(
         The fit there, initial states settled, and how far its parameters may be from there for the
         roughness, half the width of 95 % intervals, [k].
     """
+    some = np.flatnonzero(problem.fitted)
+    around = partial(_around, problem.take(some), fitted.take(some), columns)
     half = sure * np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(half, half) * sure**2
     share, ways = np.linalg.eigh(correlation)
     axes = half[:, None] * ways * np.sqrt(np.maximum(share, 1e-6))
     for _ in range(WIDENED):
-        move, unsure, is_curved = _minimum(*_around(problem, fitted, columns, axes))
+        move, unsure, is_curved = _minimum(*around(axes))
         if np.all(is_curved):
             break
         axes = np.where(is_curved, 1.0, 2.0) * axes
     else:
-        move, unsure, _ = _minimum(*_around(problem, fitted, columns, axes))
+        move, unsure, _ = _minimum(*around(axes))
     theta = fitted.theta.copy()
     theta[columns] += axes @ move
     return follow(problem, theta, fitted), np.sqrt(np.sum((axes * unsure) ** 2, axis=1))
@@ -58,7 +62,7 @@ def _around(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray
     values = np.clip(here + steps, [p.low for p in slots], [p.high for p in slots])
     thetas = np.tile(fitted.theta, (len(values), 1))
     thetas[:, columns] = values
-    costs = [fit.cost[problem.fitted].sum() for fit in follow_each(problem, thetas, fitted)]
+    costs = [fit.cost.sum() for fit in follow_each(problem, thetas, fitted)]
     return np.linalg.solve(axes, (values - here).T).T, np.asarray(costs)
 
 
