@@ -5,17 +5,15 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from scipy import optimize
 
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.robust import orthonormal, without
 from garat_jax.effects import Effect, Suggestion
+from garat_jax.effects.most import follow_most
 
 REVERSED = 0.05
 """Speed, relative to its root mean square, within which dry friction is smoothed here."""
-NEAR = 0.1
-"""Distance from fitted laws, relative to the torques' median, from which its size counts."""
 
 
 def suggest(
@@ -67,17 +65,9 @@ def _without_friction(m: MissingTorque, dof: int) -> np.ndarray:
     noise opens and closes are few but huge.
     """
     rub = _friction(m, dof)
-    columns = np.stack([np.ones(len(rub)), m.position[:, dof], *rub.T], axis=1)
-    unit = np.linalg.norm(columns, axis=0) / len(rub) ** 0.5 + 1e-12
     torque = m.torque[:, dof]
-    level = np.median(torque)
-    size = float(np.median(np.abs(torque - level))) + 1e-12
-
-    def rest(factor: np.ndarray) -> np.ndarray:
-        return (columns / unit) @ factor - (torque - level) / size
-
-    found = optimize.least_squares(rest, np.zeros(len(unit)), loss="soft_l1", f_scale=NEAR).x
-    return torque - rub @ (found * size / unit)[2:]
+    _, factor = follow_most(np.column_stack([m.position[:, dof], rub]), torque)
+    return torque - rub @ factor[1:]
 
 
 def _friction(m: MissingTorque, dof: int) -> np.ndarray:

@@ -42,13 +42,12 @@ def smooth_minimum(
     correlation = covariance / np.outer(half, half) * sure**2
     share, ways = np.linalg.eigh(correlation)
     axes = half[:, None] * ways * np.sqrt(np.maximum(share, 1e-6))
+    move, unsure, is_curved = _minimum(*around(axes))
     for _ in range(WIDENED):
-        move, unsure, is_curved = _minimum(*around(axes))
         if np.all(is_curved):
             break
         axes = np.where(is_curved, 1.0, 2.0) * axes
-    else:
-        move, unsure, _ = _minimum(*around(axes))
+        move, unsure, is_curved = _minimum(*around(axes))
     theta = fitted.theta.copy()
     theta[columns] += axes @ move
     return follow(problem, theta, fitted), np.sqrt(np.sum((axes * unsure) ** 2, axis=1))

@@ -14,6 +14,7 @@ from scipy import optimize, signal
 from garat_jax.effects.actuator import can_bias, make_affine
 from garat_jax.effects.at_joint import at_dof
 from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+from garat_jax.effects.most import follow_most, median_distance
 
 BINS_PER_PERIOD = 4
 """Bins of the angle in the shortest period of a ripple."""
@@ -23,8 +24,6 @@ FINER = 4
 """Points of the spectrum for each that the range of the angle resolves."""
 SMOOTH = 3
 """Degree of the polynomial of the angle that stands for other laws beside a ripple."""
-NEAR = 0.1
-"""Distance from a line, relative to the torques' median, beyond which it counts by its size."""
 CLEAR = 0.1
 """Torque that a line rises by over the position's spread, relative to the torques' median distance
 from theirs, below which it is lost among them."""
@@ -151,14 +150,15 @@ class JointStiffness(Effect):
         one whose torque has no end within the bounds of the reference: that is a constant torque.
         """
         del rests
-        slope, level = _line(position, torque)
+        level, (slope,) = follow_most(position[:, None], torque)
         stiffness, reference = cls.parameters()
-        if not 0.0 < -slope <= stiffness.high:
+        is_clear = -slope * np.std(position) > CLEAR * median_distance(torque)
+        if not is_clear or -slope > stiffness.high:
             return None
         middle = -level / slope
         if not reference.low < middle < reference.high:
             return None
-        return Suggestion(({"stiffness": -slope, "reference": middle},), 1)
+        return Suggestion(({"stiffness": float(-slope), "reference": float(middle)},), 1)
 
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Put both springs into one."""
@@ -276,25 +276,6 @@ class CoggingTorque(Effect):
         angle = state.qpos[model.host.jnt_qposadr[joint]]
         torque = self.amplitude * jnp.sin(self.periods * angle + self.phase)
         return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
-
-
-def _line(position: np.ndarray, torque: np.ndarray) -> tuple[float, float]:
-    """Return slope and level of the line nearest to most of the torques; 0 if that is not clear.
-
-    Distances count by their size (pseudo-Huber loss): what noise makes of contacts are few torques,
-    but huge ones.
-    """
-    middle, level = np.median(position), np.median(torque)
-    spread = float(np.std(position)) + 1e-12
-    size = float(np.median(np.abs(torque - level))) + 1e-12
-    at, wanted = (position - middle) / spread, (torque - level) / size
-
-    def rest(line: np.ndarray) -> np.ndarray:
-        return line[0] * at + line[1] - wanted
-
-    nearest = optimize.least_squares(rest, np.zeros(2), loss="soft_l1", f_scale=NEAR).x
-    slope = float(nearest[0] * size / spread) if abs(nearest[0]) > CLEAR else 0.0
-    return slope, float(level + nearest[1] * size) - slope * float(middle)
 
 
 def _highest_peak(position: np.ndarray, torque: np.ndarray, low: float, high: float):
