@@ -182,8 +182,9 @@ def with_twins(
 ) -> list[Contender]:
     """Add the candidates that are a contender under another name.
 
-    Two geoms that touch nothing but each other have the same contacts: one fit serves both. Where
-    segments that were not screened show a difference, the other has a fit of its own.
+    Two geoms that touch nothing but each other have the same contacts, and a motor's back EMF is
+    the damping of the joint that it drives alone: one fit serves both. Where segments that were not
+    screened show a difference, the other has a fit of its own.
     """
     screened = {score.effect: score for score in scores}
     fitted = {contender.score.effect for contender in contenders}
@@ -198,21 +199,23 @@ def with_twins(
 
 
 def twins(problem: Problem, score: Score, others: Sequence[Score]) -> list[Score]:
-    """Return those of the others that are of its kind and change the very same where screened."""
-    simulator = problem.simulator
-
-    def what(score: Score) -> list[str]:
-        names = [simulator.slots[j].parameter.name for j in score.columns]
-        return [simulator.effects[score.effect].kind, *names]
-
-    same = [s for s in others if what(s) == what(score) and cosine(score, s) > SAME]
+    """Return those of the others that change the very same where screened, at the same sizes."""
+    same = [s for s in others if len(s.size) == len(score.size) and cosine(score, s) > SAME]
     return [s for s in same if np.allclose(s.size, score.size)]
 
 
 def _as_twin(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender | None:
     """Return a contender's fit under another name; None if that predicts something else."""
-    names = columns_of(problem.simulator.slots, score.effect)
-    columns = tuple(names[problem.simulator.slots[j].parameter.name] for j in twin.score.columns)
+    slots = problem.simulator.slots
+    own, other = (list(columns_of(slots, s.effect).values()) for s in (twin.score, score))
+    names = dict(zip(own, other, strict=False))
+    if not names.keys() >= {*twin.score.columns}:
+        return None
+    columns = tuple(names[j] for j in twin.score.columns)
+    bounds = [slots[j].parameter for j in columns]
+    values = twin.fit.theta[list(twin.score.columns)]
+    if not all(p.low <= value <= p.high for p, value in zip(bounds, values, strict=True)):
+        return None
     fitted = renamed(twin.fit, twin.score.columns, columns, without=current.theta)
     predicted = problem.simulator.predict(fitted.theta[None], fitted.start[None], problem.segments)
     if not np.allclose(problem.whiten(predicted)[0], fitted.residual, atol=1e-6):

@@ -23,10 +23,12 @@ from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.starts import (
     KEPT_PROMISE,
     SETTLE_STEPS,
+    SETTLED,
     Fit,
     choose,
     follow,
     follow_each,
+    measured_anew,
     promised_costs,
     settle,
     settle_anew,
@@ -38,8 +40,8 @@ FITTED = 1e-4
 """Fall of the cost, relative to it, below which a fit has converged."""
 DESCENTS = 2
 """Largest number of times that Gauss-Newton steps are begun; see `fit`."""
-STALLED = 3
-"""Accepted steps in a row, none of which lowers the cost by `LITTLE`, after which a fit with wider
+STALLED = 4
+"""Steps in a row, none of which lowers the cost by `LITTLE`, after which a fit with wider
 differences has converged, too: initial states promise for ever what jumps do not let them keep."""
 LITTLE = 1e-3
 """Fall of the cost, relative to it."""
@@ -237,6 +239,9 @@ def _descend(
 ):
     """Take Gauss-Newton steps of parameters and initial states together; see `fit`.
 
+    Each segment decides for itself whether its initial state follows, and when the derivatives by
+    it are measured again.
+
     Args:
         problem: What is fitted.
         free: Indices of the parameters to fit.
@@ -252,45 +257,49 @@ def _descend(
     """
     damping, undamped, stalled = 1e-4, np.zeros(len(start)), 0
     patience = STALLED if np.any(near.relative > STEP) else iterations
+    is_old = np.full(len(start), is_stale)
 
-    def at(theta, start, sensitivity) -> Linearisation:
+    def at(some: Problem, theta, start, sensitivity) -> Linearisation:
         steps = difference_steps(problem, theta, free, near.relative)
-        return linearise(problem, theta, start, free, steps, sensitivity)
+        return linearise(some, theta, start, free, steps, sensitivity)
 
     lin = near.linearisation
     for taken in range(iterations):
         change, _ = _parameter_step(problem, theta, lin, free, damping)
         expected = lin.residual + lin.parameters @ change
         start_change = start_step(problem, lin, expected, undamped, 0.0)
-        before = np.sum(lin.residual[problem.fitted] ** 2)
-        promised = promised_costs(lin, expected, start_change)[problem.fitted].sum()
-        if before - promised < FITTED * before or damping > MOST_DAMPED or stalled == patience:
+        before = np.sum(lin.residual**2, 1)
+        promised = before - promised_costs(lin, expected, start_change)
+        cost, promise = before[problem.fitted].sum(), promised[problem.fitted].sum()
+        if promise < FITTED * cost or damping > MOST_DAMPED or stalled == patience:
             break
-        if taken > 1 and promised > BEATEN * rival:
+        if taken > 1 and cost - promise > BEATEN * rival:
             break
         starts = start + start_change * problem.segments.start_unit
-        trial_theta = theta.copy()
-        trial_theta[list(free)] += change
-        trial = at(trial_theta, starts, lin.start)
-        fall = before - np.sum(trial.residual[problem.fitted] ** 2)
-        if fall <= 0:  # perhaps for some initial states' sake only
-            stayed = at(trial_theta, start, lin.start)
-            better = np.sum(stayed.residual**2, 1) < np.sum(trial.residual**2, 1)
-            starts = np.where(better[:, None], start, starts)
-            trial = choose(better, stayed, trial)
-            fall = before - np.sum(trial.residual[problem.fitted] ** 2)
+        moved_theta = theta.copy()
+        moved_theta[list(free)] += change
+        trial = at(problem, moved_theta, starts, lin.start)
+        worse = np.flatnonzero(np.sum(trial.residual**2, 1) > before)
+        if len(worse):  # perhaps for their initial states' sake only
+            stayed = at(problem.take(worse), moved_theta, start[worse], lin.start[worse])
+            better = np.sum(stayed.residual**2, 1) < np.sum(trial.residual[worse] ** 2, 1)
+            chosen = worse[better]
+            starts[chosen] = start[chosen]
+            trial.residual[chosen] = stayed.residual[better]
+            trial.parameters[chosen] = stayed.parameters[better]
+        falls = before - np.sum(trial.residual**2, 1)
+        fall = falls[problem.fitted].sum()
+        missed = is_old & (promised > SETTLED * before) & (falls < KEPT_PROMISE * promised)
+        stalled = 0 if fall > LITTLE * cost else stalled + 1
         if fall > 0:
-            stalled = 0 if fall > LITTLE * before else stalled + 1
-            follows = np.sum(trial.residual**2, 1) < np.sum(lin.residual**2, 1)
-            moved = problem.fitted | follows
+            moved = problem.fitted | (falls > 0)
             start = np.where(moved[:, None], starts, start)
-            theta, lin, damping = trial_theta, choose(moved, trial, lin), damping * 0.1
-        elif not is_stale:
-            damping = max(damping, 1e-3) * 30.0
-        if is_stale and fall < KEPT_PROMISE * (before - promised):
-            lin, is_stale = at(theta, start, None), False
-        elif fall > 0:
-            is_stale = True
+            theta, lin, damping = moved_theta, choose(moved, trial, lin), damping * 0.1
+            is_old = is_old | moved
+        elif not np.any(missed):
+            damping = max(damping, 0.1) * 10.0
+        if np.any(missed):
+            lin, is_old = measured_anew(problem, theta, start, lin, missed), is_old & ~missed
     return theta, start, lin
 
 

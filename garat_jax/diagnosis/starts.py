@@ -181,12 +181,27 @@ def settle_starts(problem: Problem, theta, start, lin: Linearisation, iterations
         damping = np.where(better, damping * 0.1, later)
         again = open_still & (is_stale | better) & (fall < KEPT_PROMISE * promised)
         if np.any(again):
-            own = theta[again] if np.ndim(theta) > 1 else theta
-            some = problem.take(again)
-            fresh = linearise(some, own, start[again], (), (), residual=lin.residual[again])
-            lin.start[again] = fresh.start
+            lin = measured_anew(problem, theta, start, lin, again)
         is_stale = np.where(again, False, is_stale | better)
     return start, lin
+
+
+def measured_anew(problem: Problem, theta, start, lin: Linearisation, chosen) -> Linearisation:
+    """Return a linearisation with the derivatives by some segments' initial states as they are now.
+
+    Args:
+        problem: What is fitted.
+        theta: Parameters, [num_parameters] or, each segment its own, [S, num_parameters].
+        start: Initial states, [S, nq + nv].
+        lin: The linearisation there.
+        chosen: Which segments, [S] bool.
+    """
+    own = theta[chosen] if np.ndim(theta) > 1 else theta
+    some = problem.take(chosen)
+    fresh = linearise(some, own, start[chosen], (), (), residual=lin.residual[chosen])
+    sensitivity = lin.start.copy()
+    sensitivity[chosen] = fresh.start
+    return lin._replace(start=sensitivity)
 
 
 def promised_costs(lin: Linearisation, residual: np.ndarray, change: np.ndarray) -> np.ndarray:

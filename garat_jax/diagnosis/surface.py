@@ -42,20 +42,24 @@ def smooth_minimum(
     correlation = covariance / np.outer(half, half) * sure**2
     share, ways = np.linalg.eigh(correlation)
     axes = half[:, None] * ways * np.sqrt(np.maximum(share, 1e-6))
-    move, unsure, is_curved = _minimum(*around(axes))
-    for _ in range(WIDENED):
-        if np.all(is_curved):
+    size, num_axes, widened = len(OFFSETS) * len(columns), len(columns), 0
+    at, costs, flat = np.empty((size, num_axes)), np.empty(size), np.ones(num_axes, bool)
+    while True:
+        chosen = np.repeat(flat, len(OFFSETS))
+        at[chosen], costs[chosen] = around(axes, flat)
+        move, unsure, is_curved = _minimum(at, costs)
+        if widened == WIDENED or np.all(is_curved):
             break
-        axes = np.where(is_curved, 1.0, 2.0) * axes
-        move, unsure, is_curved = _minimum(*around(axes))
+        widened, flat = widened + 1, ~is_curved
+        axes = np.where(flat, 2.0, 1.0) * axes
     theta = fitted.theta.copy()
     theta[columns] += axes @ move
     return follow(problem, theta, fitted), np.sqrt(np.sum((axes * unsure) ** 2, axis=1))
 
 
-def _around(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
-    """Return places around a fit, in units of the axes, [n, k], and the costs there, [n]."""
-    steps = np.concatenate([np.outer(OFFSETS, axis) for axis in axes.T])
+def _around(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray, along):
+    """Return places along some axes [k] bool, in units of them all, [n, k], and the costs, [n]."""
+    steps = np.concatenate([np.outer(OFFSETS, axis) for axis in axes.T[along]])
     slots = [problem.simulator.slots[j].parameter for j in columns]
     here = fitted.theta[columns]
     values = np.clip(here + steps, [p.low for p in slots], [p.high for p in slots])

@@ -13,7 +13,7 @@ from garat_jax.diagnosis.surface import smooth_minimum
 
 EXTRAPOLATED = 0.1
 """Share of the shift to a timestep of 0 that is uncertain at least: it is extrapolated from half of
-one. It is as much more as half the shift fails to do what was promised of it."""
+one. It is as much more as half the shift does less, or more, than was promised of it."""
 
 REFITTED = 24
 """Segments that are fitted again at least, at both timesteps."""
@@ -54,14 +54,14 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     moved = np.clip(moved, *_bounds(problem))
     shift = (moved - theta)[list(free)]
     kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
-    if kept < KEPT_PROMISE:
+    if abs(1.0 - kept) > 1.0 - KEPT_PROMISE:
         low, high = _wider(interval(problem, theta, lin, free, keep), rough)
         shift = _shift_by_fits(problem, fitted)
         low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
         return dataclasses.replace(fitted, low=low, high=high)
     timeless = lin._replace(residual=fitted.residual + 2.0 * halved)
     low, high = _wider(interval(problem, moved, timeless, free, keep), rough)
-    unsure = max(EXTRAPOLATED, 1.0 - kept) * np.abs(shift)
+    unsure = max(EXTRAPOLATED, abs(1.0 - kept)) * np.abs(shift)
     return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
 
 

@@ -69,7 +69,7 @@ def test_segments_near_their_noise_are_left_alone(puck):
 def test_friction_of_a_contact_is_fitted_from_afar_with_an_interval(puck, first):
     misled = settle(puck, np.array([0.5]), puck.segments.start).start
     found = fit(puck, np.array([first]), misled, (0,))
-    assert found.theta[0] == pytest.approx(FRICTION, rel=0.01)
+    assert found.theta[0] == pytest.approx(FRICTION, rel=0.02)
     assert 1e-3 < found.high[0] - found.low[0] < 0.02
     assert root_mean_square(found.residual) < 2.0
 
