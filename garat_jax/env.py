@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,10 @@ from garat_jax.types import Params
 
 LARGEST = 1e10
 """Absolute value beyond which a state has exploded; MuJoCo's own limit, mjMAXVAL."""
+
+
+Transform = Callable[[jax.Array, jax.Array], jax.Array]
+"""A fixed action transformer; see `TaskEnv`."""
 
 
 class EnvState(NamedTuple):
@@ -135,11 +140,19 @@ class Env(abc.ABC):
 class TaskEnv(Env):
     """A task on physics: the world that agents act in; `params` are its `Dynamics`.
 
-    The policy sees what the sensors report; reward and termination judge the truth.
+    The policy sees what the sensors report; reward and termination judge the truth. The reward is
+    for the action that the policy asked for, as on the machine, whatever is sent instead of it.
+
+    Args:
+        task: The task.
+        world: The dynamics.
+        transform: A fixed action transformer, (qpos and qvel as the sensors report them [nq + nv],
+            command [nu]) -> command that is sent instead.
     """
 
-    def __init__(self, task: Task, world: Dynamics):
+    def __init__(self, task: Task, world: Dynamics, transform: Transform | None = None):
         host = world.host.model
+        self.transform = transform
         limited = host.actuator_ctrllimited.astype(bool)
         self.task = task
         self.episode_length = task.episode_length
@@ -160,7 +173,8 @@ class TaskEnv(Env):
         """Hold the clipped action as the command for one control step."""
         del key
         action = self.clip(action)
-        physics = dynamics.step(params, state.physics, action, self.task.num_substeps)
+        command = self._command(params, state.physics, action)
+        physics = dynamics.step(params, state.physics, command, self.task.num_substeps)
         reward = self.task.reward(state.physics, action, physics)
         terminated = self.task.terminated(physics)
         steps = state.steps + 1
@@ -173,6 +187,13 @@ class TaskEnv(Env):
         if params.engine != "mujoco":
             return state
         return state._replace(physics=state.physics._replace(time=jnp.full((), jnp.nan)))
+
+    def _command(self, params: Dynamics, physics: PhysicsState, action: jax.Array) -> jax.Array:
+        """Return the command [nu] that is sent for an action."""
+        if self.transform is None:
+            return action
+        sensed = dynamics.sensed(params, physics)
+        return self.clip(self.transform(jnp.concatenate([sensed.qpos, sensed.qvel]), action))
 
     def _observe(self, params: Dynamics, physics: PhysicsState) -> jax.Array:
         """Return the observation [obs_size] of what the sensors report."""

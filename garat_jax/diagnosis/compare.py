@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import plotly.graph_objects as go
 
@@ -19,7 +18,7 @@ from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric, noise_floor
-from garat_jax.diagnosis.model_card import Model, load_model
+from garat_jax.diagnosis.model_card import Model, check_same_machine, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.quality import Quality, assess
@@ -34,7 +33,6 @@ from garat_jax.diagnosis.unseen import STILL, is_still
 from garat_jax.dynamics import native_model
 from garat_jax.effects.base import element_names
 from garat_jax.effects.catalogue import Catalogue
-from garat_jax.errors import UserError
 from garat_jax.provenance import versions
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
 
@@ -163,7 +161,8 @@ def compare(
     started = time.monotonic()
     host = native_model(model.compile(engine="mujoco"))
     for other in also:
-        _check_alike(other, model, host)
+        theirs = other.compile(engine="mujoco").host.model
+        check_same_machine(other.path, theirs, model.path, host)
     qualities = tuple(assess(r, host) for r in recordings)
     torques = compare_torques(host, recordings)
     recordings = thin(recordings)
@@ -246,18 +245,6 @@ def read_recordings(
         for warning in recording.warnings:
             tell(f"warning: {warning}")
     return recordings
-
-
-def _check_alike(other: Model, model: Model, host: mujoco.MjModel) -> None:
-    """Refuse a model that other recordings would belong to."""
-    theirs = other.compile(engine="mujoco").host.model
-    for element in ("joint", "actuator"):
-        wanted, there = element_names(host, element), element_names(theirs, element)
-        if wanted != there:
-            raise UserError(
-                f"{other.path}: its {element}s are {', '.join(there) or 'none'}, those of "
-                f"{model.path} {', '.join(wanted) or 'none'}; expected models of the same machine"
-            )
 
 
 def _at_horizons(played: Mapping[float, Replay]) -> tuple[AtHorizon, ...]:

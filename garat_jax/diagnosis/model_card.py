@@ -7,17 +7,18 @@ with `element name field value`, and `[[effect]]` tables with `kind target param
 import dataclasses
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import mujoco
 import numpy as np
 
 from garat_jax.dynamics import Dynamics, Override, compile
 from garat_jax.effects import CATALOGUE, Effect
+from garat_jax.effects.base import element_names
 from garat_jax.effects.catalogue import Catalogue, load_catalogue
+from garat_jax.env import Task, TaskEnv, Transform, World
 from garat_jax.errors import UserError, choose, unknown_name
 from garat_jax.overrides import load_spec
 
@@ -40,8 +41,8 @@ class Model:
         effects: Physical effects added to it.
         catalogue: The kinds of effect that a diagnosis may find missing in it.
         transform: A learned action transformer, (qpos and qvel as the sensors report them
-            [nq + nv], command [nu]) -> command sent instead. Predictions have it, `compile` does
-            not.
+            [nq + nv], command [nu]) -> command sent instead. Predictions and `world` have it,
+            `compile` does not.
     """
 
     name: str
@@ -51,11 +52,46 @@ class Model:
     overrides: tuple[Override, ...] = ()
     effects: tuple[Effect, ...] = ()
     catalogue: Catalogue = dataclasses.field(default_factory=lambda: CATALOGUE)
-    transform: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+    transform: Transform | None = None
 
     def compile(self, engine: str = "auto", extra_effects: Sequence[Effect] = ()) -> Dynamics:
         """Compile the model, with more effects after its own; see `dynamics.compile`."""
         return compile(self.spec, self.overrides, (*self.effects, *extra_effects), engine)
+
+    def world(self, task: Task, engine: str = "auto") -> World:
+        """Return a task in this model, to train in: with its effects, and its action transformer.
+
+        A transformer acts once a control step of the task, which should last as long as those that
+        it was learned on.
+
+        Args:
+            task: What to do; its own model may differ in all but joints and actuators.
+            engine: As for `dynamics.compile`.
+
+        Raises:
+            UserError: The task's own model has other joints or actuators, or as `compile`.
+        """
+        params = self.compile(engine)
+        own = compile(load_spec(task.mjcf), engine="mujoco").host.model
+        check_same_machine(self.path, params.host.model, task.mjcf, own)
+        return World(TaskEnv(task, params, self.transform), params)
+
+
+def check_same_machine(
+    path: Path, model: mujoco.MjModel, other_path: Path, other: mujoco.MjModel
+) -> None:
+    """Refuse a model whose joints or actuators have other names than another's.
+
+    Raises:
+        UserError: They have.
+    """
+    for element in ("joint", "actuator"):
+        there, wanted = element_names(model, element), element_names(other, element)
+        if wanted != there:
+            raise UserError(
+                f"{path}: its {element}s are {', '.join(there) or 'none'}, those of "
+                f"{other_path} {', '.join(wanted) or 'none'}; expected models of the same machine"
+            )
 
 
 def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
