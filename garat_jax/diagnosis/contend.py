@@ -58,7 +58,7 @@ def fit_contenders(
     likely = [s for s in scores if not s.excluded and s.possible and s.share > 0.02]
     likely = [s for s in likely if s.share > 0.25 * likely[0].share]
     likely = [s for s in likely if not simpler_law(problem, s, likely)]
-    likely = [s for i, s in enumerate(likely) if not twins(problem, s, likely[:i])]
+    likely = [s for i, s in enumerate(likely) if not twins(s, likely[:i])]
     if not likely:
         return []
     chosen = likely[:CONTENDERS]
@@ -182,45 +182,61 @@ def with_twins(
 ) -> list[Contender]:
     """Add the candidates that are a contender under another name.
 
-    Two geoms that touch nothing but each other have the same contacts, and a motor's back EMF is
-    the damping of the joint that it drives alone: one fit serves both. Where segments that were not
-    screened show a difference, the other has a fit of its own.
+    Two geoms that touch nothing but each other have the same contacts; a motor's back EMF is the
+    damping of the joint that it drives alone, where the integrator takes both alike and no limit of
+    the force cuts in: one fit serves both. Where segments that were not screened show a difference,
+    the other has a fit of its own.
     """
     screened = {score.effect: score for score in scores}
     fitted = {contender.score.effect for contender in contenders}
-    others = [s for s in scores if not s.excluded and s.effect not in fitted]
+    others = [s for s in scores if not s.excluded and s.possible and s.effect not in fitted]
     found = []
     for contender in contenders:
-        for score in twins(problem, screened[contender.score.effect], others):
-            same = _as_twin(problem, current, contender, score)
+        like = screened[contender.score.effect]
+        for score in twins(like, others):
+            same = _as_twin(problem, current, contender, like, score)
             rival = contender.fit.cost[problem.fitted].sum()
             found.append(same or _fit(problem, current, score, rival, say))
     return [*contenders, *found]
 
 
-def twins(problem: Problem, score: Score, others: Sequence[Score]) -> list[Score]:
+def twins(score: Score, others: Sequence[Score]) -> list[Score]:
     """Return those of the others that change the very same where screened, at the same sizes."""
     same = [s for s in others if len(s.size) == len(score.size) and cosine(score, s) > SAME]
     return [s for s in same if np.allclose(s.size, score.size)]
 
 
-def _as_twin(problem: Problem, current: Fit, twin: Contender, score: Score) -> Contender | None:
-    """Return a contender's fit under another name; None if that predicts something else."""
-    slots = problem.simulator.slots
-    own, other = (list(columns_of(slots, s.effect).values()) for s in (twin.score, score))
-    names = dict(zip(own, other, strict=False))
+def _as_twin(problem: Problem, current: Fit, twin: Contender, like: Score, score: Score):
+    """Return a contender's fit under another name; None if that predicts something else.
+
+    Args:
+        problem: What is fitted.
+        current: The fit of the effects selected so far.
+        twin: The contender.
+        like: What screening said of it.
+        score: What it said of the other: the same, at the same sizes.
+    """
+    names = _stands_for(problem, like, score)
     if not names.keys() >= {*twin.score.columns}:
         return None
     columns = tuple(names[j] for j in twin.score.columns)
-    bounds = [slots[j].parameter for j in columns]
     values = twin.fit.theta[list(twin.score.columns)]
-    if not all(p.low <= value <= p.high for p, value in zip(bounds, values, strict=True)):
+    if np.any(problem.within_bounds(columns, values) != values):
         return None
     fitted = renamed(twin.fit, twin.score.columns, columns, without=current.theta)
     predicted = problem.simulator.predict(fitted.theta[None], fitted.start[None], problem.segments)
     if not np.allclose(problem.whiten(predicted)[0], fitted.residual, atol=1e-6):
         return None
     return Contender(dataclasses.replace(score, columns=columns), fitted)
+
+
+def _stands_for(problem: Problem, one: Score, other: Score) -> dict[int, int]:
+    """Return which parameter of another law stands for which of one, by index."""
+    effects, slots = problem.simulator.effects, problem.simulator.slots
+    if effects[one.effect].kind != effects[other.effect].kind:
+        return dict(zip(one.columns, other.columns, strict=True))
+    theirs = columns_of(slots, other.effect)
+    return {j: theirs[name] for name, j in columns_of(slots, one.effect).items()}
 
 
 def renamed(fitted: Fit, old: Sequence[int], new: Sequence[int], without: np.ndarray) -> Fit:

@@ -25,7 +25,6 @@ from garat_jax.diagnosis.starts import (
     SETTLE_STEPS,
     SETTLED,
     Fit,
-    choose,
     follow,
     follow_each,
     measured_anew,
@@ -38,11 +37,19 @@ from garat_jax.diagnosis.starts import (
 
 FITTED = 1e-4
 """Fall of the cost, relative to it, below which a fit has converged."""
+STEPS = 24
+"""Largest number of Gauss-Newton steps in a row."""
 DESCENTS = 2
-"""Largest number of times that Gauss-Newton steps are begun; see `fit`."""
+"""Largest number of times that they are begun: again where initial states sought anew lowered the
+cost, or wider differences are needed than were at first."""
+SHRINK = 10.0
+"""Factor of the damping from a step that is not taken to the next; a tenth after one that is."""
+FIRST_SHRUNK = 1.0
+"""Damping, relative to what the data say, after the first that is not: half the step."""
 STALLED = 4
-"""Steps in a row, none of which lowers the cost by `LITTLE`, after which a fit with wider
-differences has converged, too: initial states promise for ever what jumps do not let them keep."""
+"""Steps in a row, taken or not, none of which lowers the cost by `LITTLE`, after which a fit with
+wider differences has converged, too: initial states promise for ever what jumps do not let them
+keep."""
 LITTLE = 1e-3
 """Fall of the cost, relative to it."""
 MOST_DAMPED = 1e4
@@ -74,24 +81,20 @@ def fit(
     theta,
     start,
     free,
-    iterations: int = 24,
     rival: float = np.inf,
     sensitivity: np.ndarray | None = None,
 ) -> Fit:
     """Fit some parameters within their bounds, and every initial state.
 
-    Parameters see the fitted segments only. The initial states of those held out follow as long as
-    that lowers their own cost, and are settled at the end. Where no difference is clear of the
-    jumps of contacts, and more is left than noise, a search goes on from what Gauss-Newton steps
-    have reached.
+    Parameters see the fitted segments only; the initial states of those held out follow. Where no
+    difference is clear of the jumps of contacts, and more is left than noise, a search goes on from
+    what Gauss-Newton steps have reached.
 
     Args:
         problem: What is fitted.
         theta: Where to start, [num_parameters].
         start: Initial states to start from, [S, nq + nv].
         free: Indices of the parameters to fit.
-        iterations: Largest number of Gauss-Newton steps, and again where initial states sought anew
-            lowered the cost, or wider differences are needed than were at first.
         rival: Cost on the fitted segments that another fit reached; steps that promise no more than
             `BEATEN` times that are not taken; beyond `SEARCHED_WITHIN` times there is no search.
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
@@ -103,7 +106,7 @@ def fit(
     is_stale, descents = sensitivity is not None, 0
     while True:
         near, descents = there, descents + 1
-        theta, start, lin = _descend(problem, free, iterations, rival, theta, start, near, is_stale)
+        theta, start, lin = _descend(problem, free, rival, theta, start, near, is_stale)
         start, settled, is_better = _settle_all(problem, theta, start, lin)
         there = _differences_there(problem, theta, start, free, near.relative, settled)
         is_wider = np.any(there.is_clear & (there.relative > near.relative))
@@ -135,8 +138,6 @@ def _differences_there(
 
 def _settle_all(problem: Problem, theta, start, lin: Linearisation):
     """Settle all initial states at a fit's end; say if those sought anew lowered its cost."""
-    if not np.all(problem.fitted):  # some of those held out did not follow
-        lin = linearise(problem, theta, start, (), (), lin.start)
     start, lin = settle_starts(problem, theta, start, lin, SETTLE_STEPS)
     before = np.sum(lin.residual[problem.fitted] ** 2)
     start, lin = settle_anew(problem, theta, start, lin)
@@ -209,12 +210,10 @@ def _search(problem: Problem, near: Fit, free, relative) -> np.ndarray:
     steps = difference_steps(problem, near.theta, free, relative)
     steps = np.abs(steps)
     least = FINEST * steps
-    parameters = [problem.simulator.slots[j].parameter for j in free]
-    low, high = ([getattr(p, end) for p in parameters] for end in ("low", "high"))
     ways = np.concatenate([-np.eye(len(free)), np.eye(len(free))])
     for _ in range(SEARCH_STEPS):
         thetas = np.tile(near.theta, (len(ways), 1))
-        thetas[:, free] = np.clip(thetas[:, free] + ways * steps, low, high)
+        thetas[:, free] = problem.within_bounds(free, thetas[:, free] + ways * steps)
         trials = follow_each(problem, thetas, near)
         costs = [trial.cost.sum() for trial in trials]
         along = int(np.argmin(costs))
@@ -227,16 +226,7 @@ def _search(problem: Problem, near: Fit, free, relative) -> np.ndarray:
     return near.theta
 
 
-def _descend(
-    problem: Problem,
-    free,
-    iterations: int,
-    rival: float,
-    theta,
-    start,
-    near: Differences,
-    is_stale: bool,
-):
+def _descend(problem: Problem, free, rival: float, theta, start, near: Differences, is_stale: bool):
     """Take Gauss-Newton steps of parameters and initial states together; see `fit`.
 
     Each segment decides for itself whether its initial state follows, and when the derivatives by
@@ -245,7 +235,6 @@ def _descend(
     Args:
         problem: What is fitted.
         free: Indices of the parameters to fit.
-        iterations: Largest number of steps.
         rival: As for `fit`.
         theta: Where to start, [num_parameters].
         start: Initial states, [S, nq + nv].
@@ -256,15 +245,9 @@ def _descend(
         Parameters, initial states and the linearisation at them.
     """
     damping, undamped, stalled = 1e-4, np.zeros(len(start)), 0
-    patience = STALLED if np.any(near.relative > STEP) else iterations
-    is_old = np.full(len(start), is_stale)
-
-    def at(some: Problem, theta, start, sensitivity) -> Linearisation:
-        steps = difference_steps(problem, theta, free, near.relative)
-        return linearise(some, theta, start, free, steps, sensitivity)
-
-    lin = near.linearisation
-    for taken in range(iterations):
+    patience = STALLED if np.any(near.relative > STEP) else STEPS
+    lin, is_old = near.linearisation, np.full(len(start), is_stale)
+    for taken in range(STEPS):
         change, _ = _parameter_step(problem, theta, lin, free, damping)
         expected = lin.residual + lin.parameters @ change
         start_change = start_step(problem, lin, expected, undamped, 0.0)
@@ -275,32 +258,53 @@ def _descend(
             break
         if taken > 1 and cost - promise > BEATEN * rival:
             break
+        moved = theta.copy()
+        moved[list(free)] += change
+        steps = difference_steps(problem, moved, free, near.relative)
         starts = start + start_change * problem.segments.start_unit
-        moved_theta = theta.copy()
-        moved_theta[list(free)] += change
-        trial = at(problem, moved_theta, starts, lin.start)
-        worse = np.flatnonzero(np.sum(trial.residual**2, 1) > before)
-        if len(worse):  # perhaps for their initial states' sake only
-            stayed = at(problem.take(worse), moved_theta, start[worse], lin.start[worse])
-            better = np.sum(stayed.residual**2, 1) < np.sum(trial.residual[worse] ** 2, 1)
-            chosen = worse[better]
-            starts[chosen] = start[chosen]
-            trial.residual[chosen] = stayed.residual[better]
-            trial.parameters[chosen] = stayed.parameters[better]
+        starts, trial = _tried(problem, moved, free, steps, start, starts, lin)
         falls = before - np.sum(trial.residual**2, 1)
         fall = falls[problem.fitted].sum()
         missed = is_old & (promised > SETTLED * before) & (falls < KEPT_PROMISE * promised)
         stalled = 0 if fall > LITTLE * cost else stalled + 1
         if fall > 0:
-            moved = problem.fitted | (falls > 0)
-            start = np.where(moved[:, None], starts, start)
-            theta, lin, damping = moved_theta, choose(moved, trial, lin), damping * 0.1
-            is_old = is_old | moved
-        elif not np.any(missed):
-            damping = max(damping, 0.1) * 10.0
+            theta, start, lin, damping = moved, starts, trial, damping / SHRINK
+            is_old = np.ones(len(start), bool)
+        elif not np.any(missed & problem.fitted):
+            damping = max(damping * SHRINK, FIRST_SHRUNK)
         if np.any(missed):
             lin, is_old = measured_anew(problem, theta, start, lin, missed), is_old & ~missed
     return theta, start, lin
+
+
+def _tried(problem: Problem, theta, free, steps, stay, move, lin: Linearisation):
+    """Linearise where initial states move, or stay in segments that move for the worse.
+
+    Args:
+        problem: What is fitted.
+        theta: Parameters, [num_parameters].
+        free: Indices of the parameters to perturb.
+        steps: Their perturbations.
+        stay: Initial states before the step, [S, nq + nv].
+        move: Those after it.
+        lin: The linearisation before the step.
+
+    Returns:
+        Initial states, [S, nq + nv], and the linearisation there.
+    """
+    trial = linearise(problem, theta, move, free, steps, lin.start)
+    cost = np.sum(trial.residual**2, 1)
+    worse = np.flatnonzero(cost > np.sum(lin.residual**2, 1))
+    if not len(worse):
+        return move, trial
+    some, near = problem.take(worse), lin.start[worse]
+    stayed = linearise(some, theta, stay[worse], free, steps, near)
+    better = np.sum(stayed.residual**2, 1) < cost[worse]
+    chosen, start, residual = worse[better], move.copy(), trial.residual.copy()
+    parameters = trial.parameters.copy()
+    start[chosen], residual[chosen] = stay[chosen], stayed.residual[better]
+    parameters[chosen] = stayed.parameters[better]
+    return start, Linearisation(residual, parameters, trial.start)
 
 
 def excited(problem: Problem, free, sensitivity: np.ndarray) -> np.ndarray:

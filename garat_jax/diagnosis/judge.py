@@ -211,7 +211,7 @@ def estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate]
 def _unfitted(problem: Problem, score: Score, others: Sequence[Score], why: str) -> Candidate:
     simulator, nan = problem.simulator, float("nan")
     effect = simulator.effects[score.effect]
-    alike = twins(problem, score, [o for o in others if o is not score and not o.excluded])
+    alike = twins(score, [o for o in others if o is not score and not o.excluded])
     named = [simulator.effects[other.effect] for other in alike]
     parameters = {}
     for j, size in zip(score.columns, score.size, strict=False):

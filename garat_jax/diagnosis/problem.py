@@ -113,6 +113,11 @@ class Problem(Generic[AnySimulator]):
         segments = self.segments.take(chosen)
         return dataclasses.replace(self, segments=segments, fitted=self.fitted[chosen])
 
+    def within_bounds(self, columns, values: np.ndarray) -> np.ndarray:
+        """Return values of some parameters, [..., k], clipped to their bounds."""
+        slots = [self.simulator.slots[j].parameter for j in columns]
+        return np.clip(values, [p.low for p in slots], [p.high for p in slots])
+
     def whiten(self, predicted: np.ndarray) -> np.ndarray:
         """Return whitened residuals [..., S, N] of predictions [..., S, L, num_signals]."""
         s = self.segments

@@ -228,6 +228,7 @@ def _round(problem: Problem, metric: Metric, current: Fit, held, floor: Floor, s
     gap = is_above(problem, metric, current, floor)
     scores = screen(problem, current, held)
     contenders = fit_contenders(problem, current, scores, say) if gap else []
+    contenders = with_twins(problem, current, scores, contenders, say)
     contenders = _refine(problem, metric, current, scores, contenders, floor, say)
     contenders = with_twins(problem, current, scores, contenders, say)
     num_tests = len([score for score in scores if not score.excluded])
@@ -298,17 +299,20 @@ def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Fl
     for the next round, where other effects rival it, if the simpler law proves itself.
     """
 
-    def proves_itself(best: Contender) -> bool:
-        return held_out_gain(problem, metric, current, best.fit).low > 0
+    def refinements(best: Contender, contenders: list[Contender]) -> list[Contender]:
+        proves_itself = held_out_gain(problem, metric, current, best.fit).low > 0
+        names = [c for c in contenders if c.fit.residual is best.fit.residual]
+        found = [fit_refinements(problem, current, c, scores, say, proves_itself) for c in names]
+        return [contender for some in found for contender in some]
 
-    for find in (
-        lambda best: fit_refinements(problem, current, best, scores, say, proves_itself(best)),
-        lambda best: fit_further(problem, best, say),
-    ):
+    def further(best: Contender, _) -> list[Contender]:
+        return fit_further(problem, best, say)
+
+    for find in (refinements, further):
         best = min(contenders, key=lambda c: c.fit.cost.sum(), default=None)
         if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
             break
-        for contender in find(best):
+        for contender in find(best, contenders):
             if leads(problem, contender.fit, best.fit):
                 replaced = (best.score.effect, contender.score.effect)
                 others = (c for c in contenders if c.score.effect not in replaced)

@@ -1,5 +1,6 @@
 """Which experiment tells effects apart that a recording cannot."""
 
+import math
 from collections.abc import Sequence
 
 import mujoco
@@ -71,12 +72,14 @@ UNKNOWN_PASSIVE = (
 def next_experiment(candidates: Sequence[Candidate], host: mujoco.MjModel) -> Experiment | None:
     """Return the experiment that separates the first candidate with unlike explanations.
 
+    Of candidates that were not fitted nothing is claimed that there would be to tell apart.
+
     Args:
         candidates: What was found.
         host: The compiled model: its actuators, and which geoms can touch.
     """
     for candidate in candidates:
-        if candidate.indistinguishable_from:
+        if candidate.indistinguishable_from and math.isfinite(candidate.error_after):
             others = candidate.indistinguishable_from
             ways = dict.fromkeys(_way(candidate.named, other, host) for other in others)
             return Experiment((candidate.named, *others), "; ".join(ways))

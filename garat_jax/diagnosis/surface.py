@@ -4,8 +4,6 @@ Where the cost jumps from one set of parameters to the next, a fit ends in the d
 met. A quadratic through the costs around it (Box and Wilson 1951) is what all of them say.
 """
 
-from functools import partial
-
 import numpy as np
 from scipy import stats
 
@@ -37,36 +35,36 @@ def smooth_minimum(
         roughness, half the width of 95 % intervals, [k].
     """
     some = np.flatnonzero(problem.fitted)
-    around = partial(_around, problem.take(some), fitted.take(some), columns)
+    problem_here, here = problem.take(some), fitted.take(some)
     half = sure * np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(half, half) * sure**2
     share, ways = np.linalg.eigh(correlation)
     axes = half[:, None] * ways * np.sqrt(np.maximum(share, 1e-6))
-    size, num_axes, widened = len(OFFSETS) * len(columns), len(columns), 0
-    at, costs, flat = np.empty((size, num_axes)), np.empty(size), np.ones(num_axes, bool)
+    num_axes, widened = len(columns), 0
+    places = np.empty((len(OFFSETS) * num_axes, num_axes))
+    costs, flat = np.empty(len(places)), np.ones(num_axes, bool)
     while True:
-        chosen = np.repeat(flat, len(OFFSETS))
-        at[chosen], costs[chosen] = around(axes, flat)
-        move, unsure, is_curved = _minimum(at, costs)
+        rows = np.repeat(flat, len(OFFSETS))
+        places[rows], costs[rows] = _around(problem_here, here, columns, axes[:, flat])
+        move, unsure, is_curved = _minimum(np.linalg.solve(axes, places.T).T, costs)
         if widened == WIDENED or np.all(is_curved):
             break
         widened, flat = widened + 1, ~is_curved
         axes = np.where(flat, 2.0, 1.0) * axes
     theta = fitted.theta.copy()
-    theta[columns] += axes @ move
+    theta[columns] = problem.within_bounds(columns, theta[columns] + axes @ move)
     return follow(problem, theta, fitted), np.sqrt(np.sum((axes * unsure) ** 2, axis=1))
 
 
-def _around(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray, along):
-    """Return places along some axes [k] bool, in units of them all, [n, k], and the costs, [n]."""
-    steps = np.concatenate([np.outer(OFFSETS, axis) for axis in axes.T[along]])
-    slots = [problem.simulator.slots[j].parameter for j in columns]
+def _around(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
+    """Return places along some axes [k, m], as changes of the parameters [n, k], and costs [n]."""
+    steps = np.concatenate([np.outer(OFFSETS, axis) for axis in axes.T])
     here = fitted.theta[columns]
-    values = np.clip(here + steps, [p.low for p in slots], [p.high for p in slots])
+    values = problem.within_bounds(columns, here + steps)
     thetas = np.tile(fitted.theta, (len(values), 1))
     thetas[:, columns] = values
     costs = [fit.cost.sum() for fit in follow_each(problem, thetas, fitted)]
-    return np.linalg.solve(axes, (values - here).T).T, np.asarray(costs)
+    return values - here, np.asarray(costs)
 
 
 def _minimum(at: np.ndarray, costs: np.ndarray):

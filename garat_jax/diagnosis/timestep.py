@@ -15,6 +15,8 @@ EXTRAPOLATED = 0.1
 """Share of the shift to a timestep of 0 that is uncertain at least: it is extrapolated from half of
 one. It is as much more as half the shift does less, or more, than was promised of it."""
 
+UNFELT = 0.1
+"""Norm of what a shift is to change, in standard deviations of noise, below which it is none."""
 REFITTED = 24
 """Segments that are fitted again at least, at both timesteps."""
 
@@ -23,10 +25,10 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     """Move the estimates to where a timestep of 0 would have them, and the intervals with them.
 
     At the model's own timestep a parameter also makes up for the integrator's error, which may be
-    many times the noise. Where halving the timestep does not do what sensitivities promise, as
-    across contacts, estimates stay, fits at both timesteps say how far they are from those at 0,
-    and their intervals reach as far. Where contacts make the cost rough, that of a smooth
-    surface counts; see `smooth_minimum`.
+    many times the noise. Where halving the timestep does much less or more than sensitivities
+    promise, as across contacts, estimates stay, fits at both timesteps say how far they are from
+    those at 0, and their intervals reach as far. Where contacts make the cost rough, that of a
+    smooth surface counts; see `smooth_minimum`.
     """
     keep = np.asarray([j not in fitted.frozen for j in fitted.free], bool)
     if not np.any(keep):
@@ -51,7 +53,7 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     labels = block_labels(problem)[problem.fitted].ravel()
     moved = theta.copy()
     moved[np.asarray(free)[keep]] += regress(sensitivity[:, keep], change, labels).coefficient
-    moved = np.clip(moved, *_bounds(problem))
+    moved = problem.within_bounds(range(len(moved)), moved)
     shift = (moved - theta)[list(free)]
     kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
     if abs(1.0 - kept) > 1.0 - KEPT_PROMISE:
@@ -79,14 +81,8 @@ def _shift_by_fits(problem: Problem, near: Fit) -> np.ndarray:
         return fit(there, near.theta, near.start, near.free, sensitivity=near.sensitivity).theta
 
     shift = 2.0 * (fitted_by(problem.finer) - fitted_by(problem.simulator))
-    moved = np.clip(near.theta + shift, *_bounds(problem))
+    moved = problem.within_bounds(range(len(shift)), near.theta + shift)
     return (moved - near.theta)[list(near.free)]
-
-
-def _bounds(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest values of all parameters, [num_parameters] each."""
-    parameters = [slot.parameter for slot in problem.simulator.slots]
-    return np.asarray([p.low for p in parameters]), np.asarray([p.high for p in parameters])
 
 
 def _wider(ends: tuple[np.ndarray, np.ndarray], rough: np.ndarray):
@@ -102,12 +98,16 @@ def _wider(ends: tuple[np.ndarray, np.ndarray], rough: np.ndarray):
 def _kept_promise(problem: Problem, half: Linearisation, fitted: Fit, shift) -> float:
     """Return how much of the change that half the timestep makes a shift of parameters undoes.
 
-    Relative to what sensitivities promise; the change is the residual in `half`.
+    Relative to what sensitivities promise; the change is the residual in `half`. Where that would
+    hardly show, it is as promised.
     """
     moved = fitted.theta.copy()
     moved[list(fitted.free)] += shift
     there = problem.integrator_error(moved, fitted.start, fitted.residual)
     sensitivity, before = projected(problem, half)
     _, found = projected(problem, half._replace(residual=there))
-    promised = np.sum(before**2) - np.sum((before + sensitivity @ shift) ** 2)
+    effect = sensitivity @ shift
+    if np.linalg.norm(effect) < UNFELT:
+        return 1.0
+    promised = np.sum(before**2) - np.sum((before + effect) ** 2)
     return float((np.sum(before**2) - np.sum(found**2)) / max(promised, 1e-300))

@@ -48,6 +48,7 @@ def test_a_hidden_effect_is_found_and_sized(tmp_path, kind):
 def test_a_clean_model_is_adequate(tmp_path):
     _, found = find(tmp_path, 20, "none", **FASTEST)
     assert found.verdict == "adequate"
+    assert found.next_experiment is None
     assert not found.selected
     assert not any(candidate.passes for candidate in found.candidates)
     unseen = {one.effect for one in found.unseen}

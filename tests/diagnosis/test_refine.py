@@ -7,6 +7,7 @@ import pytest
 
 from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.effects import CATALOGUE
+from tests import models
 from tests.diagnosis.pendulum import MODEL, record
 
 KINDS = ("coulomb_friction", "viscous_damping", "stribeck_friction", "asymmetric_friction")
@@ -61,3 +62,16 @@ def test_damping_with_a_little_dry_friction_is_not_called_asymmetric():
     found = diagnose(model, [record(rub, seed) for seed in range(4)])
     assert found.selected[0].effect == "viscous_damping"
     assert "asymmetric_friction" not in [c.effect for c in found.selected]
+
+
+def test_damping_is_refined_whatever_name_it_was_fitted_under():
+    kinds = ("back_emf", "viscous_damping", "asymmetric_friction")
+    spec = models.spec(models.PENDULUM.replace("Euler", "implicitfast"))
+    catalogue = {kind: CATALOGUE[kind] for kind in kinds}
+    model = dataclasses.replace(MODEL, spec=spec, catalogue=catalogue)
+
+    def rub(speed: float) -> float:
+        return -(0.004 if speed > 0 else 0.04) * speed
+
+    found = diagnose(model, [record(lambda spec: None, seed, torque=rub) for seed in range(4)])
+    assert [c.effect for c in found.selected] == ["asymmetric_friction"]

@@ -41,3 +41,13 @@ def test_of_other_pairs_nothing_untrue_is_promised():
     assert "no experiment is known" in how
     assert "--separate torque_offset@joint/hinge cogging_torque@joint/hinge" in how
     assert "garat plan" not in ask(*pair, models.TUMBLER)  # no commands
+
+
+def test_of_what_was_not_fitted_nothing_is_to_be_told_apart():
+    late = Named("sensor_delay", "all")
+    unfitted = dataclasses.replace(
+        FRICTION, effect="actuator_delay", target="actuator/motor", error_after=float("nan"),
+        indistinguishable_from=(late,),
+    )  # fmt: skip
+    host = mujoco.MjModel.from_xml_string(models.PENDULUM)
+    assert next_experiment([unfitted], host) is None

@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from garat_jax.diagnosis import surface
 from garat_jax.diagnosis.fit import fit, uncertainty
 from garat_jax.diagnosis.problem import Problem, linearise
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit, follow, follow_each
 from garat_jax.diagnosis.surface import smooth_minimum
-from garat_jax.effects import ViscousDamping
+from garat_jax.effects import TorqueOffset, ViscousDamping
 from tests.diagnosis.test_fit import make_problem, record
 
 TRUTH = 0.02
@@ -71,3 +72,34 @@ def test_the_deepest_dip_of_a_rough_cost_is_left_for_the_middle_of_all(smooth):
     assert of_middles < 0.6 * of_dips
     assert np.median(unsure) > 0.2 * half
     assert all(abs(error) < 2 * width for (_, error), width in zip(errors, unsure, strict=True))
+
+
+def test_places_keep_up_with_axes_that_are_widened_later(monkeypatch):
+    recordings = [record(np.arange(400) * 0.004, seed=seed) for seed in range(2)]
+    laws = [ViscousDamping("joint/hinge"), TorqueOffset("joint/hinge")]
+    problem = make_problem(recordings, laws)
+    both, base = np.asarray([0, 1]), problem.simulator.base
+    found = follow(problem, base, fit(problem, base, problem.segments.start, both))
+    lin = linearise(problem, base, found.start, both, [1e-4, 1e-3], found.sensitivity)
+    covariance, sure = uncertainty(problem, lin, np.asarray([True, True]))
+    seen, minimum = [], surface._minimum
+
+    def second_is_flat(at, costs):
+        seen.append(at.copy())
+        return *minimum(at, costs)[:2], np.asarray([True, False])
+
+    monkeypatch.setattr(surface, "_minimum", second_is_flat)
+    smooth_minimum(problem, found, both, covariance, sure)
+    kept = len(surface.OFFSETS)
+    assert np.any(seen[0][:kept, 1] != 0)  # the bound of damping, 0, bends the first axis
+    np.testing.assert_allclose(seen[1][:kept], seen[0][:kept] * [1.0, 0.5], atol=1e-9)
+
+
+def test_a_minimum_beyond_a_bound_is_not_gone_to():
+    time = np.arange(400) * 0.004
+    recordings = [record(time, damping=-0.006, seed=seed) for seed in range(2)]
+    problem = make_problem(recordings, [ViscousDamping("joint/hinge")])
+    found = fit(problem, problem.simulator.base, problem.segments.start, COLUMNS)
+    lin = linearise(problem, found.theta, found.start, COLUMNS, [1e-4], found.sensitivity)
+    covariance, sure = uncertainty(problem, lin, np.asarray([True]))
+    assert smooth_minimum(problem, found, COLUMNS, covariance, sure)[0].theta[0] >= 0.0

@@ -5,10 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from garat_jax.diagnosis import timestep
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.metric import trusted
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.timestep import count_timestep
+from garat_jax.effects import ViscousDamping
+from tests.diagnosis.test_fit import UNIFORM, make_problem, record
 from tests.diagnosis.test_starts import FRICTION, puck
 
 __all__ = ["puck"]
@@ -35,3 +38,17 @@ def test_across_contacts_an_interval_reaches_as_far_as_fits_at_both_timesteps(pu
     assert counted.theta[0] == pytest.approx(FRICTION, abs=0.005)
     assert FRICTION - 0.03 < counted.low[0] < FRICTION - 0.01
     assert FRICTION - 0.005 < counted.high[0] < FRICTION + 0.005
+
+
+@pytest.mark.parametrize(("kept", "stays"), [(0.2, True), (1.8, True), (0.7, False), (1.3, False)])
+def test_a_shift_that_does_less_or_more_than_promised_is_not_made(monkeypatch, kept, stays):
+    monkeypatch.setattr(timestep, "_kept_promise", lambda *_: kept)
+    recordings = [record(UNIFORM, damping=0.02, noise=1e-5, finer=32)]
+    problem = make_problem(recordings, [ViscousDamping("joint/hinge")])
+    found = fit(problem, problem.simulator.base, problem.segments.start, (0,))
+    counted = count_timestep(problem, found)
+    assert bool(counted.theta[0] == found.theta[0]) is stays
+    assert counted.low[0] < 0.02 < counted.high[0]
+    if not stays:
+        shift = abs(counted.theta[0] - found.theta[0])
+        assert counted.high[0] - counted.low[0] > 2 * abs(1 - kept) * shift

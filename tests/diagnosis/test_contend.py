@@ -1,0 +1,50 @@
+"""One law under two names is fitted once; two laws that look alike are fitted twice."""
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.contend import fit_contenders, with_twins
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.screen import screen
+from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
+from garat_jax.effects import BackEmf, ViscousDamping
+from tests import models
+from tests.diagnosis.test_fit import UNIFORM, record
+
+LAWS = (ViscousDamping("joint/hinge"), BackEmf("actuator/motor"))
+
+
+def contenders_of(integrator: str):
+    spec = models.spec(models.PENDULUM.replace("Euler", integrator))
+    model = Model("pendulum", __file__, __file__, spec)
+    recordings = [record(UNIFORM, damping=0.02, seed=seed) for seed in range(2)]
+    grid = choose_grid(recordings, 0.002)
+    segments = cut(recordings, grid, 0.4)
+    coarse, finer = (Simulator(model, LAWS, grid, refine) for refine in (1, 2))
+    fitted = np.arange(len(segments.start)) % 4 > 0
+    problem = Problem(coarse, finer, segments, fitted, grid.interval * grid.per_sample)
+    current, said = settle(problem, problem.simulator.base, segments.start), []
+    scores = screen(problem, current)
+    first = fit_contenders(problem, current, scores, said.append)
+    return with_twins(problem, current, scores, first, said.append), said
+
+
+def test_back_emf_is_damping_under_another_name():
+    (one, other), said = contenders_of("implicitfast")
+    assert len(said) == 1
+    assert {one.score.effect, other.score.effect} == {0, 1}
+    assert other.fit.residual is one.fit.residual
+    for contender in (one, other):
+        (column,) = contender.score.columns
+        assert contender.fit.free == (column,)
+        assert contender.fit.theta[column] == pytest.approx(0.02, rel=0.05)
+        assert contender.fit.theta[1 - column] == 0.0
+
+
+def test_what_the_integrator_treats_otherwise_has_a_fit_of_its_own():
+    (one, other), said = contenders_of("Euler")
+    assert len(said) == 2
+    assert other.fit.residual is not one.fit.residual
