@@ -71,6 +71,13 @@ def test_plan(capsys):
     assert "300 commands at 100 Hz, time,ctrl." in capsys.readouterr().out
 
 
+def test_train_in_repaired(capsys):
+    errors = run("08_train_in_repaired.py")["errors"]
+    assert errors["repaired"] < 0.06
+    assert errors["as it is"] > 2 * errors["repaired"]
+    assert "trained in the model repaired: " in capsys.readouterr().out
+
+
 def test_an_own_effect_takes_under_30_lines():
     text = (EXAMPLES / "my_effects.py").read_text(encoding="utf-8")
     assert sum(bool(line.strip()) for line in text.splitlines()) < 30

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.replay import replay
 from garat_jax.effects import CATALOGUE
+from garat_jax.env import Task
 from garat_jax.errors import UserError
 from garat_jax.ground import GroundConfig, ground, load_grounded
 from garat_jax.ground.run import load_policy
@@ -27,6 +29,28 @@ from tests import models
 SMALL = GroundConfig(
     "gat", GATConfig(num_envs=16, num_steps=25), num_updates=3, num_transitions=300, num_held_out=50
 )
+
+
+@dataclasses.dataclass(frozen=True)
+class Hang(Task):
+    """A task that pays the action asked for."""
+
+    mjcf: Path
+    num_substeps: int = 10
+    episode_length: int = 20
+    solved_return: float = 1.0
+
+    def initial(self, host, key):
+        return jnp.full(host.nq, 0.3), jnp.full(host.nv, -1.0)
+
+    def observe(self, state):
+        return jnp.concatenate([state.qpos, state.qvel])
+
+    def reward(self, before, action, after):
+        return action[0]
+
+    def terminated(self, after):
+        return jnp.zeros((), bool)
 
 
 @pytest.fixture(scope="module")
@@ -213,6 +237,29 @@ def test_a_run_is_read_back(grounded):
     assert sent.shape == (1,)
     assert control["low"][0] <= sent[0] <= control["high"][0]
     assert sent[0] != command[0]
+
+
+def test_a_task_in_a_grounded_model_sends_what_the_transformer_makes(recorded, grounded):
+    model, task = load_grounded(grounded, {"gat": SMALL}), Hang(recorded[0])
+    assert model.transform is not None
+    world, plain = model.world(task), dataclasses.replace(model, transform=None).world(task)
+    state = world.env.reset(world.params, jax.random.key(0))
+    action = jnp.asarray([0.2])
+    sent = world.env.clip(model.transform(state.obs, action))
+    assert abs(sent[0] - action[0]) > 1e-3
+    grounded_step, step = (
+        w.env.step(w.params, state, a, jax.random.key(0))
+        for w, a in ((world, action), (plain, sent))
+    )
+    np.testing.assert_allclose(grounded_step.state.obs, step.state.obs, rtol=1e-6)
+    np.testing.assert_allclose(grounded_step.reward, action[0])
+
+
+def test_a_task_for_another_machine_is_refused(grounded, tmp_path):
+    (tmp_path / "arm.xml").write_text(models.ARM)
+    model = load_grounded(grounded, {"gat": SMALL})
+    with pytest.raises(UserError, match=r"its joints are hinge, those of .* shoulder, elbow"):
+        model.world(Hang(tmp_path / "arm.xml"))
 
 
 @pytest.mark.slow
