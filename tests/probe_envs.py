@@ -1,13 +1,15 @@
-"""Small environments without physics; each can only be learned with one particular faculty."""
+"""Small environments without physics, each of which takes one faculty to learn, and one task."""
 
+import dataclasses
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from garat_jax.env import Env, EnvState, StepResult
+from garat_jax.env import Env, EnvState, StepResult, Task
 
 
 class Probe(Env):
@@ -159,3 +161,25 @@ class Bursting(Walk):
         result = super().step(params, state, action, key)
         obs = jnp.where(result.state.obs > 0.5, self.to, result.state.obs)
         return result._replace(state=result.state._replace(obs=obs), reward=obs[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Hang(Task):
+    """A task that pays the action asked for."""
+
+    mjcf: Path
+    num_substeps: int = 10
+    episode_length: int = 20
+    solved_return: float = 1.0
+
+    def initial(self, host, key):
+        return jnp.full(host.nq, 0.3), jnp.full(host.nv, -1.0)
+
+    def observe(self, state):
+        return jnp.concatenate([state.qpos, state.qvel])
+
+    def reward(self, before, action, after):
+        return action[0]
+
+    def terminated(self, after):
+        return jnp.zeros((), bool)

@@ -12,8 +12,10 @@ import pytest
 
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.maps import read_map
+from garat_jax.diagnosis.model_card import load_model
 from garat_jax.effects.catalogue import ENTRY_POINTS
 from tests import models
+from tests.probe_envs import Hang
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 DOCUMENTS = [*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("*.md")]
@@ -76,7 +78,7 @@ def test_the_page_on_python_runs(tmp_path, monkeypatch, capsys):
         Path(name).mkdir()
         for path in (*made.fit, *made.holdout):
             path.rename(Path(name, path.name))
-    names: dict = {}
+    names: dict = {"task": Hang(Path("pendulum.xml"))}
     for snippet in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(snippet, names)
     printed = capsys.readouterr().out
@@ -92,6 +94,7 @@ def test_the_page_on_python_runs(tmp_path, monkeypatch, capsys):
         "report.html",
     ):
         assert said in printed
+    assert names["world"].params.effects[0].kind == "coulomb_friction"
     assert Path("repaired.toml").exists() and Path("excitation.csv").exists()
 
 
@@ -103,8 +106,13 @@ def test_the_page_on_own_effects_shows_the_example():
     assert list(tomllib.loads(group)["project"]["entry-points"]) == [ENTRY_POINTS]
 
 
-def test_the_diagnosis_pages_map_is_read(tmp_path):
+def test_the_diagnosis_pages_card_and_map_are_read(tmp_path):
     page = (REPOSITORY / "docs" / "diagnosis.md").read_text(encoding="utf-8")
-    (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    card, text = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "card.toml").write_text(card)
+    (tmp_path / "arm.xml").write_text(models.ARM)
+    model = load_model(tmp_path / "card.toml")
+    assert model.compile(engine="mujoco").host.model.body("forearm").mass[0] == 2.0
+    assert [effect.kind for effect in model.effects] == ["motor_curve"]
     (tmp_path / "map.toml").write_text(text)
     assert read_map(tmp_path / "map.toml").columns["qpos.elbow"].unit == "deg"

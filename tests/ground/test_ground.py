@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,6 @@ from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.replay import replay
 from garat_jax.effects import CATALOGUE
-from garat_jax.env import Task
 from garat_jax.errors import UserError
 from garat_jax.ground import GroundConfig, ground, load_grounded
 from garat_jax.ground.run import load_policy
@@ -25,32 +23,11 @@ from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.recorded import Steps, clone, nearest_command, needed_change
 from garat_jax.runs import RunDirectory
 from tests import models
+from tests.probe_envs import Hang
 
 SMALL = GroundConfig(
     "gat", GATConfig(num_envs=16, num_steps=25), num_updates=3, num_transitions=300, num_held_out=50
 )
-
-
-@dataclasses.dataclass(frozen=True)
-class Hang(Task):
-    """A task that pays the action asked for."""
-
-    mjcf: Path
-    num_substeps: int = 10
-    episode_length: int = 20
-    solved_return: float = 1.0
-
-    def initial(self, host, key):
-        return jnp.full(host.nq, 0.3), jnp.full(host.nv, -1.0)
-
-    def observe(self, state):
-        return jnp.concatenate([state.qpos, state.qvel])
-
-    def reward(self, before, action, after):
-        return action[0]
-
-    def terminated(self, after):
-        return jnp.zeros((), bool)
 
 
 @pytest.fixture(scope="module")
