@@ -25,10 +25,11 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def origin(name: str, result: dict[str, Any]) -> str:
     """Say where a table comes from."""
-    machine, changed = result["machine"], ", changed tree" if result["git"]["dirty"] else ""
+    machine, commit = result["machine"], result["git"]["commit"][:7]
+    changed = ", changed tree" if result["git"]["dirty"] else ""
     return (
         f"\n`{result['command']}` → `benchmarks/results/{name}.json` "
-        f"(commit {result['git']['commit'][:7]}{changed}, {machine['cores']} cores of an {machine['cpu']})\n"
+        f"(commit {commit}{changed}, {machine['cores']} cores of an {machine['cpu']})\n"
     )
 
 
