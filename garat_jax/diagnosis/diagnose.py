@@ -64,7 +64,7 @@ def diagnose(
     everything = thin((*fitted, *held_out))
     whole = dataclasses.replace(model, effects=(*model.effects, *shared))
     host = native_model(whole.compile(engine="mujoco"))
-    others = make_candidates(whole, native_model(model.compile(engine="mujoco")))
+    others = make_candidates(whole)
     grid = choose_grid(everything, host.opt.timestep)
     say("choosing the horizon")
     horizon, segments = choose_horizon(Simulator(whole, (), grid), everything, grid)
@@ -142,11 +142,13 @@ def _every(r: Recording, step: int) -> Recording:
     )
 
 
-def make_candidates(model: Model, host: mujoco.MjModel) -> tuple[Effect, ...]:
+def make_candidates(model: Model) -> tuple[Effect, ...]:
     """Make every effect of the catalogue at every place of a model, each without effect.
 
-    With one actuator, `all` is that actuator.
+    Places are those of the model without its own effects, of which some add bodies. With one
+    actuator, `all` is that actuator.
     """
+    host = dataclasses.replace(model, effects=()).compile(engine="mujoco").host.model
     present = {(effect.kind, effect.target) for effect in model.effects}
     candidates = []
     for kind, cls in model.catalogue.items():

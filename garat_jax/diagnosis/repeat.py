@@ -115,7 +115,7 @@ def _alone(
     everything = thin((*parts[0], *parts[1]))
     host = native_model(model.compile(engine="mujoco"))
     grid = choose_grid(everything, host.opt.timestep)
-    effects = (*nominal_effects(model, selected), *_rivals(model, host, selected, candidates))
+    effects = (*nominal_effects(model, selected), *_rivals(model, selected, candidates))
     simulator = Simulator(model, effects, grid)
     finer = Simulator(model, effects, grid, refine=2)
     theta = found_theta(simulator, selected)
@@ -148,13 +148,13 @@ def _alone(
     return sightings
 
 
-def _rivals(model: Model, host, selected, candidates) -> list[Effect]:
+def _rivals(model: Model, selected, candidates) -> list[Effect]:
     """Return the best candidates that these recordings can tell from all selected, of no size."""
     taken = {c.named for c in selected}
     taken |= {named for c in selected for named in c.indistinguishable_from}
     best = dict.fromkeys(c.named for c in candidates if c.named not in taken)
     places = list(best)[:NUM_RIVALS]
-    offered = {Named(e.kind, e.target): e for e in make_candidates(model, host)}
+    offered = {Named(e.kind, e.target): e for e in make_candidates(model)}
     return [offered[place] for place in places if place in offered]
 
 

@@ -43,7 +43,7 @@ def make_source(
 
 
 def load_grounded(
-    root: Path, configs: Mapping[str, GroundConfig], catalogue: Catalogue | None = None
+    root: str | Path, configs: Mapping[str, GroundConfig], catalogue: Catalogue | None = None
 ) -> Model:
     """Read a run of `garat ground`: its model, with the action transformer before it.
 
@@ -55,6 +55,7 @@ def load_grounded(
     Raises:
         UserError: There is no such run, or it was made with other settings.
     """
+    root = Path(root)
     run = RunDirectory.open(root)
     if checkpoint.latest_step(root / TRANSFORMER) is None or not (root / SUMMARY).is_file():
         raise UserError(f"{root} holds no action transformer; expected a run of garat ground")

@@ -47,3 +47,19 @@ def test_what_was_left_out_of_a_law_is_fitted_later_and_once():
     again = complete(problem, dataclasses.replace(whole, score=score), print)
     assert again.fit.free == whole.fit.free
     assert len({*again.fit.free}) == len(again.fit.free)
+
+
+def test_a_model_with_a_payload_is_diagnosed_again():
+    """What the payload's own body adds to the model is no place of its own."""
+    kinds = {kind: CATALOGUE[kind] for kind in (*RIVALS, "viscous_damping")}
+    payload = PayloadMass("body/pole", mass=0.3, x=0.0, z=-0.2)
+    model = dataclasses.replace(MODEL, catalogue=kinds, effects=(payload,))
+
+    def loaded(spec):
+        add_payload(spec, mass=0.3, x=0.0, z=-0.2)
+        spec.joint("hinge").damping[0] += 0.02
+
+    found = diagnose(model, [record(loaded, seed) for seed in range(4)])
+    (damping,) = found.selected
+    assert (damping.effect, damping.target) == ("viscous_damping", "joint/hinge")
+    assert damping.parameters["coefficient"].estimate == pytest.approx(0.02, rel=0.05)
