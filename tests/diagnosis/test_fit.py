@@ -63,7 +63,7 @@ def make_problem(recordings, candidates, horizon=0.4) -> Problem:
 
 
 def candidates():
-    return make_candidates(MODEL, MODEL.compile().host.model)
+    return make_candidates(MODEL)
 
 
 def column(simulator: Simulator, kind: str) -> int:

@@ -25,7 +25,7 @@ def make_simulator(mjcf: str):
     ctrl = 0.3 * np.sign(np.sin(20 * TIME))[:, None] * np.ones(host.nu)
     recording = Recording("made", TIME, *states, ctrl, {}, True, ((0, len(TIME)),), ())
     grid = choose_grid([recording], host.opt.timestep)
-    simulator = Simulator(model, make_candidates(model, host), grid)
+    simulator = Simulator(model, make_candidates(model), grid)
     return simulator, cut([recording], grid, 0.25)
 
 

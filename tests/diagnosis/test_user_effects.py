@@ -50,8 +50,7 @@ def mine(tmp_path):
 
 def test_it_is_a_candidate_at_every_joint(mine):
     model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
-    host = model.compile("mujoco").host.model
-    named = [(e.kind, e.target) for e in make_candidates(model, host)]
+    named = [(e.kind, e.target) for e in make_candidates(model)]
     assert ("my_spring", "joint/hinge") in named
     found = dataclasses.replace(FRICTION, effect="my_spring", parameters={})
     assert repaired(model, (found,)).effects[0].kind == "my_spring"

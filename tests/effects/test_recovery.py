@@ -149,7 +149,7 @@ def test_the_parameters_are_recovered(kind):
     host = model.compile(engine="mujoco").host.model
     chosen = [
         effect
-        for effect in make_candidates(model, host)
+        for effect in make_candidates(model)
         if effect.kind == kind and effect.target == (case.target or effect.target)
     ]
     assert len(chosen) == 1
