@@ -76,7 +76,7 @@ def _part(
 ) -> RunDirectory:
     """Make the folder of one stop, whose `again` says what becomes of an earlier one."""
     command = run.read_json("config.json")["command"]
-    return RunDirectory.create(run.root / name, config, command, seeds, **again)
+    return RunDirectory.create(run.path(name), config, command, seeds, **again)
 
 
 def _titled(title: str, sections: Sequence[Section]) -> list[Section]:

@@ -23,6 +23,8 @@ from garat_jax.provenance import provenance, versions
 FORMAT = "garat-run/1"
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
+CONTENTS = ".contents"
+"""Names of what the run has written, a line each: anything else in its folder is the user's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,12 +76,12 @@ class RunDirectory:
             if resume:
                 _check_same_run(root, record)
                 return cls(root, resumed=True)
+            _check_replaceable(root)
             if not force:
                 go_on = "" if resume is None else "--resume to go on, "
                 raise UserError(
                     f"{root} exists already: give --force to replace it, {go_on}or another --out"
                 )
-            _check_replaceable(root)
             shutil.rmtree(root)
         try:
             root.mkdir(parents=True, exist_ok=True)
@@ -136,6 +138,10 @@ class RunDirectory:
     def path(self, name: str) -> Path:
         """Return the path of a file in the run, and make the folder that it belongs to."""
         path = self.root / name
+        top = path.relative_to(self.root).parts[0]
+        if not (self.root / top).exists():
+            with (self.root / CONTENTS).open("a", encoding="utf-8") as file:
+                file.write(top + "\n")
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
@@ -278,7 +284,8 @@ def earlier_run_kept(root: Path) -> Iterator[None]:
 
 def _holds_results(root: Path) -> bool:
     """Say whether there is more in a run directory than how it was begun."""
-    return any(path.is_file() and path != root / CONFIG for path in root.rglob("*"))
+    begun = (root / CONFIG, root / CONTENTS)
+    return any(path.is_file() and path not in begun for path in root.rglob("*"))
 
 
 def _is_occupied(root: Path) -> bool:
@@ -319,12 +326,19 @@ def _check_replaceable(root: Path) -> None:
     """Refuse to touch what is not recognisably an earlier run."""
     if not is_run(root) or root.is_symlink():
         raise UserError(
-            f"{root} is not empty and holds no run, so --force leaves it alone; give another --out"
+            f"{root} is not empty and holds no run, so it is left alone; give another --out"
+        )
+    contents = root / CONTENTS
+    written = contents.read_text(encoding="utf-8").splitlines() if contents.exists() else []
+    if others := sorted({p.name for p in root.glob("[!.]*")} - set(written)):
+        raise UserError(
+            f"{root} holds {', '.join(others)}, which the run in it did not write, so it is left "
+            "alone; move that away or give another --out"
         )
     if Path.cwd().resolve().is_relative_to(root.resolve()):
         raise UserError(
-            f"{root} is the current folder or holds it, so --force leaves it alone; "
-            "change the folder first"
+            f"{root} is the current folder or holds it, so it is left alone; "
+            "change the folder first, or give another --out"
         )
 
 

@@ -103,6 +103,20 @@ def test_force_leaves_a_folder_alone_that_is_no_run(tmp_path, content):
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
+def test_force_leaves_a_run_alone_to_which_a_user_has_added_a_file(tmp_path):
+    run = create(tmp_path)
+    run.log(1, loss=1.0)
+    run.path("plots/loss.png").write_text("")
+    (tmp_path / "thesis.tex").write_text("years of work")
+    message = r"holds thesis\.tex, which the run in it did not write"
+    with pytest.raises(UserError, match=message):
+        create(tmp_path, force=True)
+    with pytest.raises(UserError, match=message), earlier_run_kept(tmp_path):
+        pass
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+    assert len(list(run.metrics())) == 1
+
+
 def test_force_leaves_the_target_of_a_link_alone(tmp_path):
     create(tmp_path / "run")
     (tmp_path / "link").symlink_to(tmp_path / "run")
