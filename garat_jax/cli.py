@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from garat_jax import __version__, compilation_cache
-from garat_jax.commandline import PROGRAM, how_to_go_on, parse
+from garat_jax.commandline import PROGRAM, arg, how_to_go_on, parse
 from garat_jax.commands.console import complain, make_run, print_table, say
 from garat_jax.commands.diagnosis import Compare, Diagnose, Ground, Improve, Plan
 from garat_jax.commands.machine import Device, Doctor

@@ -16,6 +16,15 @@ PROGRAM = "garat"
 _BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
 
 
+def arg(metavar: str) -> Any:
+    """Name an argument's value in the help, which leaves out a default that says nothing."""
+
+    def hint(default: str) -> str:
+        return "" if default in ("", "None") else f"(default: {default})"
+
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
+
+
 def parse(arguments: Sequence[str], commands: Mapping[str, type], description: str) -> Any:
     """Make the command that the arguments name.
 

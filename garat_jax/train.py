@@ -29,6 +29,11 @@ FAULTY = "faulty_share"
 SECONDS = "seconds.json"
 
 
+def _console() -> Console:
+    """Return a console on stderr that leaves lines as they are."""
+    return Console(stderr=True, soft_wrap=True, highlight=False)
+
+
 @dataclasses.dataclass
 class Seconds:
     """Wall time so far, that of the processes that a resumed run had before included.
@@ -57,7 +62,7 @@ class Trainer:
     run: RunDirectory
     seeds: Sequence[int]
     seconds: Seconds = dataclasses.field(default_factory=Seconds)
-    console: Console = dataclasses.field(default_factory=lambda: Console(stderr=True))
+    console: Console = dataclasses.field(default_factory=_console)
     mesh: Mesh | None = None
 
     def __post_init__(self) -> None:
@@ -97,13 +102,13 @@ class Trainer:
         first = 0
         if self.run.resumed and (latest := checkpoint.latest_step(folder)) is not None:
             state, first = checkpoint.restore(folder, state), latest
-            self.console.print(f"{stage}: restored after iteration {first}", highlight=False)
+            self.console.print(f"{stage}: restored after iteration {first}")
         if (self.run.root / _done(stage)).exists():
             return state
         if self.run.resumed:
             self.run.rewind(first, stage)
         compiled, run = self._compile(_with_finite(step), (state, params), options)
-        self.console.print(f"{stage}: memory {_memory(compiled)}", highlight=False)
+        self.console.print(f"{stage}: memory {_memory(compiled)}")
         started = time.monotonic()
         try:
             return self._loop(stage, run, state, params, first, num_iterations)
@@ -175,7 +180,7 @@ class Trainer:
                 for name, value in metrics.items()
                 if name in ("evaluation", "episode_length", "discriminator_accuracy", "error_ratio")
             )
-        self.console.print(line, highlight=False)
+        self.console.print(line)
 
     def _check(self, stage: str, iteration: int, last, new, metrics, finite: np.ndarray) -> None:
         """Stop where a learner is not finite or its worlds fail too often; warn where one does."""
@@ -208,7 +213,6 @@ class Trainer:
             self.console.print(
                 f"{what}: warning: physics left the finite numbers in "
                 f"{100 * share.max():.2g} % of {steps}; those episodes were ended",
-                highlight=False,
             )
 
     def _named(self, bad: np.ndarray) -> str:

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
+from garat_jax.commandline import arg
 from garat_jax.commands.console import check_files, check_optional, check_out, make_run, say
 from garat_jax.errors import UserError, choose
 

@@ -5,8 +5,9 @@ import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
+from garat_jax.commandline import arg
 from garat_jax.commands.console import check_files, check_optional, check_out, print_table, say
 from garat_jax.errors import UserError, choose
 
