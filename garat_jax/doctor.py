@@ -30,8 +30,9 @@ SECONDS = 1.25
 BATCH = 64
 BATCHES = (1, BATCH)
 """Simulations side by side."""
-NUM_STEPS = 100
-"""In one call of a program."""
+NUM_STEPS, NUM_SUBSTEPS = 20, 10
+"""Control steps in one call of a program, and physics steps in each: as many as in most tasks. A
+call of C MuJoCo, which is what it costs beside physics, is one a control step."""
 ENGINES = ("mujoco", "mjx")
 HOST_DEVICES = "xla_force_host_platform_device_count"
 """XLA's flag that makes several devices of one CPU."""
@@ -127,8 +128,11 @@ def prepare(world: Dynamics, batch: int) -> tuple[jax.stages.Lowered, PhysicsSta
         return dynamics.initial_state(world, angle[None], jnp.zeros(1))
 
     def run(state: PhysicsState) -> PhysicsState:
+        def control_step(state: PhysicsState) -> PhysicsState:
+            return dynamics.step(world, state, jnp.zeros(1), NUM_SUBSTEPS)
+
         def step(state: PhysicsState, _):
-            return jax.vmap(lambda s: dynamics.step(world, s, jnp.zeros(1)))(state), None
+            return jax.vmap(control_step)(state), None
 
         return jax.lax.scan(step, state, length=NUM_STEPS)[0]
 
@@ -142,7 +146,7 @@ def measure(program: jax.stages.Compiled, state: PhysicsState, batch: int, secon
     started = time.perf_counter()
     while time.perf_counter() - started < seconds:
         state, rounds = jax.block_until_ready(program(state)), rounds + 1
-    return rounds * NUM_STEPS * batch / (time.perf_counter() - started)
+    return rounds * NUM_STEPS * NUM_SUBSTEPS * batch / (time.perf_counter() - started)
 
 
 def advise(rates: list[Rate], platform: str) -> list[str]:
