@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from garat_jax import CATALOGUE, Recording, diagnose, load_model, make_world
+from garat_jax import CATALOGUE, Recording, improve, load_model, make_world
 from garat_jax.agents import trpo
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.env import Task
@@ -62,23 +62,15 @@ with tempfile.TemporaryDirectory() as folder:
         PENDULUM, Path(folder), 5, num_recordings=3, seconds=3.0, rate=125.0, kind="motor_gain"
     )
     model = load_model(PENDULUM, {kind: CATALOGUE[kind] for kind in KINDS})
-    diagnosis = diagnose(
-        model, [Recording.read(path, model) for path in (*made.fit, *made.holdout)]
-    )
-print(diagnosis)
+    recordings = [Recording.read(path, model) for path in (*made.fit, *made.holdout)]
+    improved = improve(model, recordings)
+print(improved)
 
-effects = tuple(
-    CATALOGUE[c.effect](c.target, **{name: e.estimate for name, e in c.parameters.items()})
-    for c in diagnosis.selected
-)
 truth = CATALOGUE[made.kind](made.target, **made.parameters)
 machine = make_world(Level(), effects=(truth,))
 errors = {}
-for name, world in {
-    "as it is": model.world(Level()),
-    "repaired": dataclasses.replace(model, effects=effects).world(Level()),
-}.items():
-    agent, policies = train(world)
+for name, tried in {"as it is": model, "repaired": improved.model}.items():
+    agent, policies = train(tried.world(Level()))
 
     def on_machine(policy, agent=agent):
         """Return the returns of ten episodes."""

@@ -228,7 +228,7 @@ def _round(problem: Problem, metric: Metric, current: Fit, held, floor: Floor, s
     gap = is_above(problem, metric, current, floor)
     scores = screen(problem, current, held)
     contenders = fit_contenders(problem, current, scores, say) if gap else []
-    contenders = with_twins(problem, current, scores, contenders, say)
+    contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
     contenders = _refine(problem, metric, current, scores, contenders, floor, say)
     contenders = with_twins(problem, current, scores, contenders, say)
     num_tests = len([score for score in scores if not score.excluded])

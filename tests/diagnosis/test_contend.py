@@ -1,18 +1,17 @@
 """One law under two names is fitted once; two laws that look alike are fitted twice."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from garat_jax.diagnosis.contend import fit_contenders, with_twins
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import screen
-from garat_jax.diagnosis.segments import choose_grid, cut
-from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.effects import BackEmf, ViscousDamping
 from tests import models
-from tests.diagnosis.test_fit import UNIFORM, record
+from tests.diagnosis.test_fit import UNIFORM, make_problem, record
 
 LAWS = (ViscousDamping("joint/hinge"), BackEmf("actuator/motor"))
 
@@ -21,12 +20,10 @@ def contenders_of(integrator: str):
     spec = models.spec(models.PENDULUM.replace("Euler", integrator))
     model = Model("pendulum", __file__, __file__, spec)
     recordings = [record(UNIFORM, damping=0.02, seed=seed) for seed in range(2)]
-    grid = choose_grid(recordings, 0.002)
-    segments = cut(recordings, grid, 0.4)
-    coarse, finer = (Simulator(model, LAWS, grid, refine) for refine in (1, 2))
-    fitted = np.arange(len(segments.start)) % 4 > 0
-    problem = Problem(coarse, finer, segments, fitted, grid.interval * grid.per_sample)
-    current, said = settle(problem, problem.simulator.base, segments.start), []
+    problem = make_problem(recordings, LAWS, model=model)
+    starts = problem.segments.start
+    problem = dataclasses.replace(problem, fitted=np.arange(len(starts)) % 4 > 0)
+    current, said = settle(problem, problem.simulator.base, starts), []
     scores = screen(problem, current)
     first = fit_contenders(problem, current, scores, said.append)
     return with_twins(problem, current, scores, first, said.append), said

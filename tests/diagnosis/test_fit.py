@@ -54,11 +54,11 @@ def record(time, damping=0.0, delay=0, noise=1e-3, seed=0, command=1.0, finer=1)
     )
 
 
-def make_problem(recordings, candidates, horizon=0.4) -> Problem:
+def make_problem(recordings, candidates, horizon=0.4, model=MODEL) -> Problem:
     grid = choose_grid(recordings, 0.002)
     segments = cut(recordings, grid, horizon)
     fitted = np.ones(len(segments.start), bool)
-    coarse, finer = (Simulator(MODEL, candidates, grid, refine) for refine in (1, 2))
+    coarse, finer = (Simulator(model, candidates, grid, refine) for refine in (1, 2))
     return Problem(coarse, finer, segments, fitted, grid.interval * grid.per_sample)
 
 

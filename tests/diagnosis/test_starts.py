@@ -13,11 +13,11 @@ from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem, linearise
 from garat_jax.diagnosis.screen import Score
-from garat_jax.diagnosis.segments import choose_grid, cut
-from garat_jax.diagnosis.simulate import Simulator, columns_of
+from garat_jax.diagnosis.simulate import columns_of
 from garat_jax.diagnosis.starts import measured_anew, settle, settle_anew
 from garat_jax.effects import AsymmetricFriction, ContactFriction
 from tests.diagnosis import pendulum, test_contact
+from tests.diagnosis.test_fit import make_problem
 
 FRICTION = 0.35
 
@@ -31,11 +31,7 @@ def puck() -> Problem:
 
 
 def problem_of(model: Model, recordings, effect, start: Mapping[str, float]) -> Problem:
-    effect = dataclasses.replace(effect, **start)
-    grid = choose_grid(recordings, 0.002)
-    segments = cut(recordings, grid, 0.4)
-    coarse, finer = (Simulator(model, (effect,), grid, refine) for refine in (1, 2))
-    return Problem(coarse, finer, segments, np.ones(len(segments.start), bool), grid.interval)
+    return make_problem(recordings, (dataclasses.replace(effect, **start),), model=model)
 
 
 def root_mean_square(residual: np.ndarray) -> float:
