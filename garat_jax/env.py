@@ -117,6 +117,10 @@ class Env(abc.ABC):
         """Return the action [action_size] within its bounds."""
         return jnp.clip(action, self.action_low, self.action_high)
 
+    def features(self, obs: jax.Array) -> jax.Array:
+        """Return what networks see of observations [..., obs_size], [..., features]."""
+        return obs
+
     @abc.abstractmethod
     def reset(self, params: Params, key: jax.Array) -> EnvState:
         """Start an episode."""

@@ -38,7 +38,8 @@ METHODS: dict[str, Callable[..., TransferConfig]] = {
 }
 
 GROUNDING: dict[str, GroundConfig] = {
-    "garat": GroundConfig("garat", GARATConfig(), num_updates=50),  # Desai et al. 2020
+    # Four times the paper's updates: the one that strays least from the recordings is kept.
+    "garat": GroundConfig("garat", GARATConfig(), num_updates=200),
     "gat": GroundConfig("gat", GATConfig(), num_updates=20),
 }
 """What `garat ground` learns from recordings with."""

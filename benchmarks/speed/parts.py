@@ -89,12 +89,12 @@ def _programs(world: World, agent, config: TRPOConfig) -> dict[str, Callable]:
             env, params, agent.policy, state, config.num_steps
         ),
         "advantages": lambda state, transitions: actor_critic.prepare(
-            value_net, state, transitions, config.discount, config.trace
+            env, value_net, state, transitions, config.discount, config.trace
         ),
         "direction": direction,
         "policy": lambda weights, batch: trpo.policy_step(policy_net, weights, batch, config),
         "value": lambda value, optimiser, batch, key: trpo.fit_value(
             value_net, value, optimiser, batch, key, config
         ),
-        "statistics": actor_critic.observe,
+        "statistics": lambda state, transitions: actor_critic.observe(env, state, transitions),
     }

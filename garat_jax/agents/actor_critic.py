@@ -71,8 +71,8 @@ def init_state(
 ) -> ActorCriticState:
     """Initialise networks, statistics and environments; the optimiser is left to the agent."""
     policy_key, value_key, env_key, key = jax.random.split(key, 4)
-    obs = jnp.zeros(env.obs_size)
-    normaliser = running_statistics.init_state(specs.Array((env.obs_size,), jnp.dtype("float32")))
+    obs = env.features(jnp.zeros(env.obs_size))
+    normaliser = running_statistics.init_state(specs.Array(obs.shape, jnp.dtype("float32")))
     env_state = rollout.reset(env, env_params, env_key, num_envs)
     return ActorCriticState(
         policy=PolicyParams(policy.init(policy_key, obs), normaliser),
@@ -85,22 +85,22 @@ def init_state(
     )
 
 
-def make_policy(network: GaussianPolicy) -> tuple[Policy, Any]:
+def make_policy(env: Env, network: GaussianPolicy) -> tuple[Policy, Any]:
     """Return the stochastic policy and its mean action, both on raw observations."""
 
     def sample(params: PolicyParams, obs: jax.Array, key: jax.Array):
-        distribution = forward(network, params.weights, normalise(params, obs))
+        distribution = forward(network, params.weights, normalise(env, params, obs))
         return distribution.sample_and_log_prob(seed=key)
 
     def mean(params: PolicyParams, obs: jax.Array) -> jax.Array:
-        return forward(network, params.weights, normalise(params, obs)).loc
+        return forward(network, params.weights, normalise(env, params, obs)).loc
 
     return sample, mean
 
 
-def normalise(params: PolicyParams, obs: jax.Array) -> jax.Array:
-    """Normalise observations [..., obs_size] with the running statistics."""
-    return running_statistics.normalize(obs, params.normaliser, max_abs_value=10.0)
+def normalise(env: Env, params: PolicyParams, obs: jax.Array) -> jax.Array:
+    """Normalise the features of observations [..., obs_size] with the running statistics."""
+    return running_statistics.normalize(env.features(obs), params.normaliser, max_abs_value=10.0)
 
 
 def collect(
@@ -121,6 +121,7 @@ def collect(
 
 
 def prepare(
+    env: Env,
     value: ValueNet,
     state: ActorCriticState,
     transitions: Transition,
@@ -128,7 +129,8 @@ def prepare(
     trace: Number,
 ) -> Batch:
     """Estimate advantages and flatten the batch; observations come out normalised."""
-    obs, next_obs = normalise(state.policy, jnp.stack([transitions.obs, transitions.next_obs]))
+    both = jnp.stack([transitions.obs, transitions.next_obs])
+    obs, next_obs = normalise(env, state.policy, both)
     values = forward(value, state.value, jnp.stack([obs, next_obs]))
     advantages, targets = advantage.gae(transitions, values[0], values[1], discount, trace)
     batch = Batch(
@@ -141,9 +143,9 @@ def prepare(
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
 
 
-def observe(state: ActorCriticState, transitions: Transition) -> ActorCriticState:
+def observe(env: Env, state: ActorCriticState, transitions: Transition) -> ActorCriticState:
     """Take a batch's observations into the running statistics, for the next batch."""
-    updated = running_statistics.update(state.policy.normaliser, transitions.obs)
+    updated = running_statistics.update(state.policy.normaliser, env.features(transitions.obs))
     return state._replace(policy=state.policy._replace(normaliser=updated))
 
 

@@ -42,7 +42,7 @@ def make(env: Env, config: PPOConfig) -> Agent:
     """
     policy_net = GaussianPolicy(env.action_size, config.hidden, config.initial_log_std)
     value_net = ValueNet(config.hidden)
-    policy, mean = actor_critic.make_policy(policy_net)
+    policy, mean = actor_critic.make_policy(env, policy_net)
     optimiser = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm),
         optax.adam(config.learning_rate, eps=1e-5),
@@ -68,7 +68,9 @@ def make(env: Env, config: PPOConfig) -> Agent:
 
     def step(state: ActorCriticState, env_params: Params):
         state, transitions = actor_critic.collect(env, env_params, policy, state, config.num_steps)
-        batch = actor_critic.prepare(value_net, state, transitions, config.discount, config.trace)
+        batch = actor_critic.prepare(
+            env, value_net, state, transitions, config.discount, config.trace
+        )
 
         def epoch(carry, key):
             shuffled = actor_critic.minibatches(batch, key, config.num_minibatches)
@@ -85,7 +87,7 @@ def make(env: Env, config: PPOConfig) -> Agent:
             key=key,
         )
         metrics = jax.tree.map(jnp.mean, metrics) | actor_critic.episode_metrics(state, transitions)
-        return actor_critic.observe(state, transitions), metrics, transitions
+        return actor_critic.observe(env, state, transitions), metrics, transitions
 
     return Agent(init, step, policy, mean, config.num_envs * config.num_steps)
 

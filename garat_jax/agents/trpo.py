@@ -46,7 +46,7 @@ def make(env: Env, config: TRPOConfig) -> Agent:
     """
     policy_net = GaussianPolicy(env.action_size, config.hidden, config.initial_log_std)
     value_net = ValueNet(config.hidden)
-    policy, mean = actor_critic.make_policy(policy_net)
+    policy, mean = actor_critic.make_policy(env, policy_net)
 
     def init(key: jax.Array, env_params: Params) -> ActorCriticState:
         state = actor_critic.init_state(
@@ -56,7 +56,9 @@ def make(env: Env, config: TRPOConfig) -> Agent:
 
     def step(state: ActorCriticState, env_params: Params):
         state, transitions = actor_critic.collect(env, env_params, policy, state, config.num_steps)
-        batch = actor_critic.prepare(value_net, state, transitions, config.discount, config.trace)
+        batch = actor_critic.prepare(
+            env, value_net, state, transitions, config.discount, config.trace
+        )
         weights, metrics = policy_step(policy_net, state.policy.weights, batch, config)
 
         key, value_key = jax.random.split(state.key)
@@ -71,7 +73,7 @@ def make(env: Env, config: TRPOConfig) -> Agent:
         )
         metrics = metrics | actor_critic.episode_metrics(state, transitions)
         metrics["value_loss"] = value_loss
-        return actor_critic.observe(state, transitions), metrics, transitions
+        return actor_critic.observe(env, state, transitions), metrics, transitions
 
     return Agent(init, step, policy, mean, config.num_envs * config.num_steps)
 

@@ -1,6 +1,7 @@
 """Learn an action transformer of a model from recordings, and score it on held-out ones."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,12 +15,14 @@ from garat_jax.diagnosis.compare import Comparison, compare
 from garat_jax.diagnosis.diagnose import split
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.segments import metric_spread
 from garat_jax.dynamics import Dynamics
-from garat_jax.ground.source import TRANSFORMER, make_source, with_transformer
-from garat_jax.ground.steps import choose_bounds, control_steps, draw
+from garat_jax.ground.source import FORMAT, TRANSFORMER, make_source, with_transformer
+from garat_jax.ground.steps import choose_bounds, control_paths, control_steps, draw, longest_path
 from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.grounded import GroundedEnv, Grounding
 from garat_jax.methods.recorded import (
+    Paths,
     RecordedEnv,
     Steps,
     as_recorded,
@@ -28,6 +31,7 @@ from garat_jax.methods.recorded import (
     exploring,
     nearest_command,
     needed_change,
+    path_error,
 )
 from garat_jax.methods.transition_error import transition_error
 from garat_jax.runs import RunDirectory
@@ -35,7 +39,8 @@ from garat_jax.train import FAULTY, Trainer
 from garat_jax.transfer import GroundConfig, make_method
 from garat_jax.types import Params, Policy
 
-FORMAT = "garat-ground/1"
+MOST_PATHS = 100
+"""Recorded paths that the updates of a transformer are compared on, drawn at random."""
 REACH = 3.0
 """Root mean squares of the needed change of a command that a transformer is prepared for."""
 
@@ -45,7 +50,7 @@ class Grounded:
     """A model with an action transformer, and how it does on recordings that were held out.
 
     Attributes:
-        model: The model; its predictions have the transformer.
+        model: The model; its predictions have the transformer, if one is better than none.
         comparison: Of the model as it was, with the grounded one beside it.
         summary: Content of summary.json.
     """
@@ -57,6 +62,13 @@ class Grounded:
     @property
     def sentence(self) -> str:
         """What grounding did to the held-out error, in one sentence."""
+        if self.model.transform is None:
+            return (
+                "No update of the action transformer follows the recordings better than the model "
+                "does, which stays as it is: its held-out error is "
+                f"{100 * self.comparison.error.before:.3g} % of the signals' spread; noise alone "
+                f"makes {100 * self.comparison.error.noise_floor:.2g} %."
+            )
         before, after = self.comparison.error.before, self.comparison.also[0].error
         verb, use = ("falls", "") if after < before else ("rises", " The model is better without.")
         return (
@@ -76,6 +88,8 @@ class Lesson(NamedTuple):
         agent_params: The agent's parameters.
         seen: Recorded control steps to learn from.
         unseen: Those to measure the transition error on.
+        paths: Recorded paths to choose the best update on.
+        weight: What a squared error of each signal counts in that, [nq + nv].
     """
 
     env: RecordedEnv
@@ -84,6 +98,26 @@ class Lesson(NamedTuple):
     agent_params: Params
     seen: Steps
     unseen: Steps
+    paths: Paths
+    weight: jax.Array
+
+
+class Best(NamedTuple):
+    """A method's state with the best of its transformers so far.
+
+    Attributes:
+        state: The method's.
+        transformer: The best one's parameters.
+        error: Its error on the paths, [].
+        update: Which update made it, []; 0 if none is better than no transformer.
+        updates: How many there were, [].
+    """
+
+    state: Any
+    transformer: Params
+    error: jax.Array
+    update: jax.Array
+    updates: jax.Array
 
 
 def ground(
@@ -125,12 +159,19 @@ def ground(
     agent, agent_params = (nearest_command, clone(seen)) if policy is None else (policy, ())
     trainer = Trainer(run, [seed])
     say(f"learning an action transformer with {config.method}")
-    lesson = Lesson(env, world, agent, agent_params, seen, unseen)
+    num_steps = max(1, round(config.episode / bounds.interval))
+    num_steps = min(num_steps, longest_path(fitted, bounds.interval))
+    paths = draw(control_paths(fitted, bounds.interval, num_steps), MOST_PATHS, rng)
+    spread = metric_spread(paths.state.reshape(-1, env.obs_size), deviation)
+    measured = np.arange(env.obs_size) < env.num_position
+    measured |= any(r.velocity_measured for r in fitted)
+    weight = jnp.asarray(measured / measured.mean() / spread**2, jnp.float32)
+    lesson = Lesson(env, world, agent, agent_params, seen, unseen, paths, weight)
     reach = _choose_reach(lesson, trainer)
-    method, transformer, errors = _learn(lesson, config, reach, trainer)
-    grounded = dataclasses.replace(
-        model, path=run.root, transform=with_transformer(method, env, transformer)
-    )
+    method, transformer, learned = _learn(lesson, config, reach, trainer)
+    chosen = learned["chosen"]["update"] > 0
+    transform = with_transformer(method, env, transformer) if chosen else None
+    grounded = dataclasses.replace(model, path=run.root, transform=transform)
     comparison = compare(model, held_out, say, [grounded])
     summary = {
         "format": FORMAT,
@@ -144,7 +185,7 @@ def ground(
         "reach": reach,
         "episode": config.episode,
         "transitions": len(seen.state),
-        "transition_error": errors,
+        **learned,
         "error": {
             "horizon": comparison.horizon,
             "model": comparison.error.before,
@@ -170,8 +211,8 @@ def _choose_reach(lesson: Lesson, trainer: Trainer) -> float:
 
 
 def _learn(lesson: Lesson, config: GroundConfig, reach: float, trainer: Trainer):
-    """Learn a transformer; return the method, its parameters, and held-out transition errors."""
-    env, world, agent, agent_params, seen, unseen = lesson
+    """Learn a transformer; return the method, the best parameters, and what summary.json tells."""
+    env, world, agent, agent_params, seen, unseen, paths, weight = lesson
     if isinstance(config.learner, GATConfig):
         agent = exploring(env, agent, reach)
     method = make_method(env, agent, config.reaching(reach))
@@ -179,28 +220,57 @@ def _learn(lesson: Lesson, config: GroundConfig, reach: float, trainer: Trainer)
     target = as_transitions(env, seen)
     keys = jax.random.split(jax.random.key(trainer.seeds[0]), 1)
     init = jax.vmap(method.init, (0, None, None, None))
-    start = trainer.call(init, keys, world, agent_params, target, options=options)
+    state = trainer.call(init, keys, world, agent_params, target, options=options)
     quiet = env.without_noise()  # the recorded states have theirs already
+    grounded = GroundedEnv(quiet, method.transform)
     recorded = trainer.call(lambda w: as_recorded(quiet, w, unseen), world, options=options)
     errors = _errors(quiet, world, recorded, trainer, options)
+    start = jax.vmap(quiet.at, (None, 0))
+    starts = trainer.call(start, world, jnp.asarray(paths.start, jnp.float32), options=options)
+    as_it_is = trainer.call(
+        lambda w, s: path_error(quiet, w, s, paths, weight), world, starts, options=options
+    )
 
-    def update(state, params):
-        world, agent_params, target, recorded = params
-        state, metrics = method.step(state, world, agent_params, target)
-        grounding = Grounding(world, state.transformer.policy)
-        error, faulty = transition_error(GroundedEnv(quiet, method.transform), grounding, recorded)
+    def update(best: Best, params):
+        world, agent_params, target, recorded, starts = params
+        state, metrics = method.step(best.state, world, agent_params, target)
+        transformer = state.transformer.policy
+        grounding = Grounding(world, transformer)
+        error, faulty = transition_error(grounded, grounding, recorded)
+        path = path_error(grounded, grounding, starts, paths, weight)
+        updates = best.updates + 1
+        choose = functools.partial(jnp.where, path < best.error)
+        kept = jax.tree.map(choose, transformer, best.transformer)
+        best = Best(state, kept, choose(path, best.error), choose(updates, best.update), updates)
         told = {"error": error, "error_ratio": error / errors["source"], f"error_{FAULTY}": faulty}
-        return state, metrics | told
+        return best, metrics | told | {"path_error": path}
 
-    params = (world, agent_params, target, recorded)
+    none = jnp.zeros(1, jnp.int32)
+    best = Best(state, state.transformer.policy, as_it_is[None], none, none)
+    params = (world, agent_params, target, recorded, starts)
     step = jax.vmap(update, (0, None))
-    state = trainer.train("grounding", step, start, params, config.num_updates, options)
-    transformer = jax.tree.map(lambda x: x[0], state.transformer.policy)
+    best = trainer.train("grounding", step, best, params, config.num_updates, options)
+    transformer = jax.tree.map(lambda x: x[0], best.transformer)
     folder = trainer.run.path(TRANSFORMER)
     if checkpoint.latest_step(folder) is None:
         checkpoint.save(folder, config.num_updates, transformer)
-    *_, last = (line for line in trainer.run.metrics() if line["stage"] == "grounding")
-    return method, transformer, errors | {"grounded": last["error"][0]}
+    chosen = int(best.update[0])
+    lines = [line for line in trainer.run.metrics() if line["stage"] == "grounding"]
+    errors["grounded"] = lines[chosen - 1]["error"][0] if chosen else errors["source"]
+    return (
+        method,
+        transformer,
+        {
+            "transition_error": errors,
+            "chosen": {
+                "update": chosen,
+                "path_error": float(best.error[0]),
+                "path_error_of_model": float(as_it_is),
+                "paths": len(paths.start),
+                "steps": paths.action.shape[1],
+            },
+        },
+    )
 
 
 def _errors(env: RecordedEnv, world: Dynamics, recorded, trainer: Trainer, options):

@@ -1,7 +1,7 @@
 """The command `garat ground`: read the files, learn, write the run with its report."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -114,7 +114,10 @@ def load_policy(path: Path, model: Model) -> Policy:
 
 def _write_report(run: RunDirectory, done: Grounded, name: str) -> None:
     summary, comparison = done.summary, done.comparison
-    errors = summary["transition_error"]
+    errors, chosen = summary["transition_error"], summary["chosen"]
+    interval = summary["control"]["interval"]
+    before = {"model as it is": chosen["path_error_of_model"]}
+    single = {"model as it is": errors["source"], "every command zero": errors["zero_action"]}
     report.write(
         run.path("report.html"),
         kind="A model grounded in measurements",
@@ -129,15 +132,28 @@ def _write_report(run: RunDirectory, done: Grounded, name: str) -> None:
         sections=[
             *side_by_side_section(comparison),
             Section(
+                "Which update was taken",
+                f"Recorded commands are replayed for {1000 * interval * chosen['steps']:.3g} ms "
+                f"from {chosen['paths']} of the states that the transformer was learned from. The "
+                "error is how far the state strays, as a share of the signals' spread. The "
+                + _chosen(chosen["update"]),
+                figures=[
+                    Figure(
+                        _curve(run, "path_error", before, "error over a path", chosen["update"]),
+                        "Error of the paths over the updates of the transformer.",
+                    )
+                ],
+            ),
+            Section(
                 "One control step at a time",
                 "From each held-out state the recorded command is held for one control step of "
-                f"{1000 * summary['control']['interval']:.3g} ms in the source, with and without "
+                f"{1000 * interval:.3g} ms in the source, with and without "
                 "the transformer. The error is the distance of the next state (qpos, qvel) from "
                 "the recorded one (L2), the sensors' noise included. A transformer is learned on "
                 "such steps; whether it helps to predict longer motion is said above.",
                 figures=[
                     Figure(
-                        _curve(run, errors),
+                        _curve(run, "error", single, "error of one step"),
                         "Mean error of a held-out step over the updates of the transformer. "
                         "Dashed: the model as it is, and the model with every command zero.",
                     )
@@ -148,23 +164,39 @@ def _write_report(run: RunDirectory, done: Grounded, name: str) -> None:
     )
 
 
-def _curve(run: RunDirectory, errors) -> go.Figure:
+def _chosen(update: int) -> str:
+    if update == 0:
+        return "model without a transformer strays least, so none is used."
+    return f"transformer of update {update} strays least, and is the one that is used."
+
+
+def _curve(
+    run: RunDirectory, metric: str, others: Mapping[str, float], label: str, chosen: int = 0
+) -> go.Figure:
+    """Draw a metric over the updates, beside others that do not change, and the chosen update."""
     lines = [line for line in run.metrics() if line["stage"] == "grounding"]
     figure = go.Figure()
     figure.add_scatter(
         x=[line["step"] for line in lines],
-        y=[line["error"][0] for line in lines],
+        y=[line[metric][0] for line in lines],
         name="with the transformer",
         line={"color": report.COLOURS[0], "width": 2},
     )
-    labels = {"source": "model as it is", "zero_action": "every command zero"}
-    for colour, (name, label) in zip(report.COLOURS[1:], labels.items(), strict=False):
+    for colour, (name, value) in zip(report.COLOURS[1:], others.items(), strict=False):
         figure.add_scatter(
             x=[lines[0]["step"], lines[-1]["step"]],
-            y=[errors[name]] * 2,
-            name=label,
+            y=[value] * 2,
+            name=name,
             mode="lines",
             line={"color": colour, "width": 1.5, "dash": "dash"},
         )
-    figure = report.styled(figure, xaxis_title="update", yaxis_title="error of one step")
+    if chosen:
+        figure.add_scatter(
+            x=[chosen],
+            y=[lines[chosen - 1][metric][0]],
+            name="taken",
+            mode="markers",
+            marker={"color": report.COLOURS[0], "size": 11},
+        )
+    figure = report.styled(figure, xaxis_title="update", yaxis_title=label)
     return figure.update_yaxes(rangemode="tozero")

@@ -1,7 +1,7 @@
 """A model with an action transformer before it: made after learning, read back from a run."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 
 from garat_jax import checkpoint
 from garat_jax.diagnosis.model_card import Model, load_model
+from garat_jax.diagnosis.progress import tell
 from garat_jax.dynamics import Dynamics, Override
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.errors import UserError, choose
@@ -18,6 +19,7 @@ from garat_jax.methods.recorded import RecordedEnv, Steps, as_transitions, clone
 from garat_jax.runs import RunDirectory
 from garat_jax.transfer import GroundConfig, make_method
 
+FORMAT = "garat-ground/2"
 CARD, SUMMARY, TRANSFORMER = "model.toml", "summary.json", "transformer"
 """What a run holds: the model's card, what came out, and the folder of the checkpoint."""
 
@@ -39,18 +41,22 @@ def make_source(
     timestep = Override("option", "", "timestep", bounds.interval / substeps)
     world = dataclasses.replace(model, overrides=(*model.overrides, timestep)).compile()
     length = max(1, round(episode / bounds.interval))
-    return RecordedEnv(states, noise, host.nq, bounds.low, bounds.high, substeps, length), world
+    return RecordedEnv(states, noise, host, bounds.low, bounds.high, substeps, length), world
 
 
 def load_grounded(
-    root: str | Path, configs: Mapping[str, GroundConfig], catalogue: Catalogue | None = None
+    root: str | Path,
+    configs: Mapping[str, GroundConfig],
+    catalogue: Catalogue | None = None,
+    say: Callable[[str], None] = tell,
 ) -> Model:
-    """Read a run of `garat ground`: its model, with the action transformer before it.
+    """Read a run of `garat ground`: its model, with the action transformer before it, if any.
 
     Args:
         root: The run directory.
         configs: The settings of each method by name.
         catalogue: The kinds of effect that there are.
+        say: Told if the run found that the model is better without.
 
     Raises:
         UserError: There is no such run, or it was made with other settings.
@@ -60,8 +66,20 @@ def load_grounded(
     if checkpoint.latest_step(root / TRANSFORMER) is None or not (root / SUMMARY).is_file():
         raise UserError(f"{root} holds no action transformer; expected a run of garat ground")
     summary = run.read_json(SUMMARY)
+    if summary["format"] != FORMAT:
+        raise UserError(f"{root} was written by another version of garat; ground the model again")
     config = choose("method", summary["method"], configs)
-    model = load_model(root / CARD, catalogue)
+    model = dataclasses.replace(load_model(root / CARD, catalogue), path=root)
+    if not summary["chosen"]["update"]:
+        say(f"{root}: no action transformer was better than none; this is the model as it is")
+        return model
+    error = summary["error"]
+    if error["grounded"] > error["model"]:
+        say(
+            f"{root}: with its action transformer the held-out error rises from "
+            f"{100 * error['model']:.3g} % to {100 * error['grounded']:.3g} %; "
+            "the model is better without"
+        )
     control = summary["control"]
     bounds = Bounds(control["interval"], np.asarray(control["low"]), np.asarray(control["high"]))
     host = model.compile(engine="mujoco").host.model
@@ -75,9 +93,7 @@ def load_grounded(
     )
     like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes.transformer.policy)
     transformer = checkpoint.restore(root / TRANSFORMER, like)
-    return dataclasses.replace(
-        model, path=root, transform=with_transformer(method, env, transformer)
-    )
+    return dataclasses.replace(model, transform=with_transformer(method, env, transformer))
 
 
 def with_transformer(method, env: RecordedEnv, transformer):

@@ -1,14 +1,16 @@
 """Control steps in recordings: how long they are, and how far their commands may go."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.errors import UserError
-from garat_jax.methods.recorded import Steps
+from garat_jax.methods.recorded import Paths, Steps
+
+Drawn = TypeVar("Drawn", Steps, Paths)
 
 INTERVAL = 0.02
 """Seconds of a control step, unless samples are farther apart: long enough for a change of state to
@@ -67,17 +69,27 @@ def choose_bounds(
 
 
 def control_steps(recordings: Sequence[Recording], interval: float) -> Steps:
-    """Cut recordings into control steps, one from each sample on.
+    """Cut recordings into control steps, one from each sample on; see `control_paths`.
+
+    Raises:
+        UserError: No recording is as long.
+    """
+    start, action, state = control_paths(recordings, interval, 1)
+    if not len(start):
+        raise UserError(f"no recording has {interval:g} s in a row; give a smaller --interval")
+    return Steps(start, action[:, 0], state[:, 0])
+
+
+def control_paths(recordings: Sequence[Recording], interval: float, length: int) -> Paths:
+    """Cut recordings into paths of control steps, one from each sample on.
 
     The command of a step is the mean of those held during it; its end is interpolated between
-    samples where there is none.
+    samples where there is none. There may be no path at all.
 
     Args:
         recordings: What was measured.
         interval: Seconds of a step.
-
-    Raises:
-        UserError: No recording is as long.
+        length: Steps of a path.
     """
     parts = []
     for recording in recordings:
@@ -85,16 +97,18 @@ def control_steps(recordings: Sequence[Recording], interval: float) -> Steps:
             time, state = recording.time[a:b], _state(recording)[a:b]
             held = np.diff(time)[:, None] * recording.ctrl[a : b - 1]
             integral = np.concatenate([np.zeros((1, held.shape[1])), np.cumsum(held, axis=0)])
-            starts = time + interval <= time[-1] + 1e-6 * interval
-            ends = time[starts] + interval
-            travelled = _interpolate(ends, time, integral) - integral[starts]
-            parts.append(
-                Steps(state[starts], travelled / interval, _interpolate(ends, time, state))
-            )
-    steps = Steps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    if not len(steps.state):
-        raise UserError(f"no recording has {interval:g} s in a row; give a smaller --interval")
-    return steps
+            starts = time + length * interval <= time[-1] + 1e-6 * interval
+            at = time[starts, None] + interval * np.arange(length + 1)
+            travelled = np.diff(_interpolate(at, time, integral), axis=1)
+            ends = _interpolate(at[:, 1:], time, state)
+            parts.append(Paths(state[starts], travelled / interval, ends))
+    return Paths(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def longest_path(recordings: Sequence[Recording], interval: float) -> int:
+    """Return how many control steps the longest stretch without a gap lasts, 1 or more."""
+    seconds = max(r.time[b - 1] - r.time[a] for r in recordings for a, b in r.spans)
+    return max(1, int(seconds / interval + 1e-6))
 
 
 def _state(recording: Recording) -> np.ndarray:
@@ -102,10 +116,11 @@ def _state(recording: Recording) -> np.ndarray:
 
 
 def _interpolate(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
+    """Return columns [T, C] between samples, [..., C]."""
+    return np.stack([np.interp(at, time, column) for column in values.T], axis=-1)
 
 
-def draw(steps: Steps, most: int, rng: np.random.Generator) -> Steps:
-    """Return at most so many of the steps, drawn at random."""
-    chosen = rng.permutation(len(steps.state))[:most]
-    return Steps(*(column[chosen] for column in steps))
+def draw(recorded: Drawn, most: int, rng: np.random.Generator) -> Drawn:
+    """Return at most so many of the steps or paths, drawn at random."""
+    chosen = rng.permutation(len(recorded[0]))[:most]
+    return type(recorded)(*(column[chosen] for column in recorded))

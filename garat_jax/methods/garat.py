@@ -53,7 +53,7 @@ class GARATConfig:
 
 
 class Normaliser(NamedTuple):
-    """Mean and standard deviation of (obs, action, next_obs - obs) in the target's data."""
+    """Mean and standard deviation of what D sees in the target's data; see `evidence`."""
 
     mean: jax.Array
     std: jax.Array
@@ -92,6 +92,7 @@ class GARAT:
     """
 
     def __init__(self, env: Env, agent: Policy, config: GARATConfig):
+        self.source = env
         self.config = config
         self.network = Discriminator(config.hidden)
         self.decode = decode_action(env, config.output, config.reach)
@@ -111,10 +112,8 @@ class GARAT:
         self, params: RewardParams, obs: jax.Array, action: jax.Array, next_obs: jax.Array
     ) -> jax.Array:
         """Return -log D of a transition, less the offset, []."""
-        logit = forward(
-            self.network, params.weights, features(params.normaliser, obs, action, next_obs)
-        )
-        return jax.nn.softplus(-logit) - params.offset
+        seen = evidence(self.source, params.normaliser, obs, action, next_obs)
+        return jax.nn.softplus(-forward(self.network, params.weights, seen)) - params.offset
 
     def init(self, key: jax.Array, env_params: Params, agent: Params, target: Transition):
         """Start an untrained pair.
@@ -126,7 +125,7 @@ class GARAT:
             target: Target transitions, [N]; actions within bounds.
         """
         policy_key, discriminator_key, key = jax.random.split(key, 3)
-        raw = _stack(target.obs, target.action, target.next_obs)
+        raw = _stack(self.source, target.obs, target.action, target.next_obs)
         normaliser = Normaliser(raw.mean(0), raw.std(0) + 1e-6)
         reward = RewardParams(
             self.network.init(discriminator_key, raw[0]), normaliser, jnp.zeros(())
@@ -156,9 +155,10 @@ class GARAT:
         transitions = rollout.without_faults(transitions, transitions.faulty)
         obs, action = self.env.split(transitions.obs)
         next_obs, _ = self.env.split(transitions.next_obs)
-        grounded = features(state.reward.normaliser, obs, action, next_obs)
+        normaliser = state.reward.normaliser
+        grounded = evidence(self.source, normaliser, obs, action, next_obs)
         grounded = grounded.reshape(-1, grounded.shape[-1])
-        wanted = features(state.reward.normaliser, target.obs, target.action, target.next_obs)
+        wanted = evidence(self.source, normaliser, target.obs, target.action, target.next_obs)
         key, update_key = jax.random.split(state.key)
         reward, optimiser, losses = self._update_discriminator(
             state.reward, state.optimiser, grounded, wanted, update_key
@@ -229,13 +229,13 @@ def gradient_penalty(logit, grounded: jax.Array, wanted: jax.Array, key: jax.Arr
     return jnp.mean(jnp.square(norms - 1))
 
 
-def features(
-    normaliser: Normaliser, obs: jax.Array, action: jax.Array, next_obs: jax.Array
+def evidence(
+    env: Env, normaliser: Normaliser, obs: jax.Array, action: jax.Array, next_obs: jax.Array
 ) -> jax.Array:
-    """Return what the discriminator sees, [..., 2 obs_size + action_size]."""
-    raw = _stack(obs, action, next_obs)
+    """Return what the discriminator sees, [..., features + action_size + obs_size]."""
+    raw = _stack(env, obs, action, next_obs)
     return jnp.clip((raw - normaliser.mean) / normaliser.std, -10, 10)
 
 
-def _stack(obs: jax.Array, action: jax.Array, next_obs: jax.Array) -> jax.Array:
-    return jnp.concatenate([obs, action, next_obs - obs], axis=-1)
+def _stack(env: Env, obs: jax.Array, action: jax.Array, next_obs: jax.Array) -> jax.Array:
+    return jnp.concatenate([env.features(obs), action, next_obs - obs], axis=-1)

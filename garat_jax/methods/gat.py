@@ -43,9 +43,9 @@ class Models(NamedTuple):
     """Both models; the parameters of the transformer.
 
     Attributes:
-        forward: Weights of (obs, action) -> change of obs in the target.
-        inverse: Weights of (obs, change of obs) -> action in the source.
-        obs: Scale of observations.
+        forward: Weights of (obs' features, action) -> change of obs in the target.
+        inverse: Weights of (obs' features, change of obs) -> action in the source.
+        obs: Scale of observations' features.
         change: Scale of their changes in a step.
         action: Scale of actions.
     """
@@ -127,7 +127,8 @@ class GAT:
         source = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), source)
         source = source._replace(action=self.env.clip(source.action))
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), source, target)
-        obs, change, action = (_scale(x) for x in (both.obs, both.next_obs - both.obs, both.action))
+        columns = (self.env.features(both.obs), both.next_obs - both.obs, both.action)
+        obs, change, action = (_scale(column) for column in columns)
         models = Models(
             self.forward.init(forward_key, jnp.concatenate([obs.mean, action.mean])),
             self.inverse.init(inverse_key, jnp.concatenate([obs.mean, change.mean])),
@@ -191,13 +192,16 @@ class GAT:
 
     def _change(self, models: Models, obs: jax.Array, action: jax.Array) -> jax.Array:
         """Return the normalised change of obs in the target, [..., obs_size]."""
-        inputs = [_normalise(models.obs, obs), _normalise(models.action, action)]
+        inputs = [self._normalised(models, obs), _normalise(models.action, action)]
         return forward(self.forward, models.forward, jnp.concatenate(inputs, axis=-1))
 
     def _action(self, models: Models, obs: jax.Array, change: jax.Array) -> jax.Array:
         """Return the normalised action that makes a normalised change in the source."""
-        inputs = [_normalise(models.obs, obs), change]
+        inputs = [self._normalised(models, obs), change]
         return forward(self.inverse, models.inverse, jnp.concatenate(inputs, axis=-1))
+
+    def _normalised(self, models: Models, obs: jax.Array) -> jax.Array:
+        return _normalise(models.obs, self.env.features(obs))
 
 
 def _scale(values: jax.Array) -> Scale:

@@ -45,6 +45,10 @@ class GroundedEnv(Env):
         self.action_low, self.action_high = env.action_low, env.action_high
         self.episode_length = env.episode_length
 
+    def features(self, obs: jax.Array) -> jax.Array:
+        """Return what networks see of the environment's observations."""
+        return self.env.features(obs)
+
     def reset(self, params: Grounding, key: jax.Array) -> EnvState:
         """Start an episode."""
         return self.env.reset(params.env, key)
@@ -102,6 +106,11 @@ class TransformerEnv(Env):
     def _with_action(self, params: TransformerParams, state: EnvState, key: jax.Array) -> EnvState:
         action, _ = self.agent(params.agent, state.obs, key)
         return state._replace(obs=jnp.concatenate([state.obs, self.env.clip(action)]))
+
+    def features(self, obs: jax.Array) -> jax.Array:
+        """Return what networks see of the agent's view, and its action."""
+        view, action = self.split(obs)
+        return jnp.concatenate([self.env.features(view), action], axis=-1)
 
     def split(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Split observations [..., obs_size + action_size] into the agent's view and action."""

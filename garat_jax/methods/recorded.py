@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from garat_jax import dynamics
 from garat_jax.dynamics import Dynamics, PhysicsState
-from garat_jax.env import Env, EnvState, StepResult
+from garat_jax.env import LARGEST, Env, EnvState, StepResult
 from garat_jax.rollout import Recorded
 from garat_jax.types import Params, Policy, Transition
 
@@ -33,6 +34,20 @@ class Steps(NamedTuple):
     next_state: np.ndarray
 
 
+class Paths(NamedTuple):
+    """Recorded control steps that follow each other.
+
+    Attributes:
+        start: qpos and qvel at their beginning, as the sensors report them, [N, nq + nv].
+        action: Command held during each, [N, H, nu].
+        state: The same as `start` at the end of each, [N, H, nq + nv].
+    """
+
+    start: np.ndarray
+    action: np.ndarray
+    state: np.ndarray
+
+
 class RecordedEnv(Env):
     """A model without a task: episodes begin in recorded states and earn nothing.
 
@@ -43,7 +58,7 @@ class RecordedEnv(Env):
     Args:
         states: Where episodes begin, as the sensors reported it, [N, nq + nv].
         noise: Standard deviation of the sensors' white noise, [nq + nv].
-        num_position: nq.
+        host: The model.
         action_low: Lower bounds, [nu].
         action_high: Upper bounds, [nu].
         num_substeps: Physics substeps in a control step.
@@ -54,18 +69,29 @@ class RecordedEnv(Env):
         self,
         states: np.ndarray,
         noise: np.ndarray,
-        num_position: int,
+        host: mujoco.MjModel,
         action_low: np.ndarray,
         action_high: np.ndarray,
         num_substeps: int,
         episode_length: int,
     ):
         self.states, self.noise = states, noise
-        self.num_position = num_position
+        self.num_position = host.nq
+        endless = (host.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & ~host.jnt_limited.astype(bool)
+        self.angles = host.jnt_qposadr[endless]
         self.obs_size = states.shape[1]
         self.action_low, self.action_high = action_low, action_high
         self.num_substeps = num_substeps
         self.episode_length = episode_length
+
+    def features(self, obs: jax.Array) -> jax.Array:
+        """Return observations [..., nq + nv] with sine and cosine of angles without a limit.
+
+        A network would take one turn more for another place.
+        """
+        obs = jnp.asarray(obs)
+        angle = obs[..., self.angles]
+        return jnp.concatenate([obs.at[..., self.angles].set(jnp.sin(angle)), jnp.cos(angle)], -1)
 
     def reset(self, params: Dynamics, key: jax.Array) -> EnvState:
         """Start an episode in one of the recorded states."""
@@ -179,6 +205,35 @@ def needed_change(env: RecordedEnv, params: Dynamics, steps: Steps) -> jax.Array
 
     changes = jax.vmap(one)(transitions.obs, transitions.action, transitions.next_obs)
     return jnp.sqrt(jnp.mean(jnp.square(changes), axis=0))
+
+
+def path_error(
+    env: Env, params: Params, starts: EnvState, paths: Paths, weight: jax.Array
+) -> jax.Array:
+    """Return how far an environment strays from recorded paths that it is given the commands of.
+
+    Args:
+        env: The environment; nothing in it may be random.
+        params: Its parameters.
+        starts: Its states at the start of the paths, [N].
+        paths: The paths.
+        weight: What a squared error of each signal counts, [nq + nv].
+
+    Returns:
+        The root mean square of the weighted errors, []; `LARGEST` if it is not finite.
+    """
+    key = jax.random.key(0)  # nothing draws
+
+    def advance(states: EnvState, recorded: tuple[jax.Array, jax.Array]):
+        action, wanted = recorded
+        step = jax.vmap(env.step, (None, 0, 0, None))
+        states = step(params, states, env.clip(action), key).state
+        return states, jnp.mean(weight * jnp.square(states.obs - wanted))
+
+    action, state = (jnp.swapaxes(jnp.asarray(x, jnp.float32), 0, 1) for x in paths[1:])
+    _, squares = jax.lax.scan(advance, starts, (action, state))
+    error = jnp.sqrt(squares.mean())
+    return jnp.where(jnp.isfinite(error), error, LARGEST)
 
 
 def as_transitions(env: Env, steps: Steps) -> Transition:

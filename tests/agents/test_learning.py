@@ -76,7 +76,7 @@ def train(algorithm: str, probe: str, seed: int = 0, iterations: int = ITERATION
 
 
 def values(state, *observations: float) -> np.ndarray:
-    obs = actor_critic.normalise(state.policy, jnp.asarray(observations)[:, None])
+    obs = actor_critic.normalise(AnyProbe(), state.policy, jnp.asarray(observations)[:, None])
     return np.asarray(forward(ValueNet(SHARED["hidden"]), state.value, obs))
 
 

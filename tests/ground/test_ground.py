@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +15,21 @@ from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.replay import replay
 from garat_jax.effects import CATALOGUE
+from garat_jax.env import LARGEST
 from garat_jax.errors import UserError
 from garat_jax.ground import GroundConfig, ground, load_grounded
 from garat_jax.ground.run import load_policy
 from garat_jax.ground.source import make_source
-from garat_jax.ground.steps import choose_bounds, control_steps
+from garat_jax.ground.steps import choose_bounds, control_paths, control_steps, longest_path
 from garat_jax.methods.gat import GATConfig
-from garat_jax.methods.recorded import Steps, clone, nearest_command, needed_change
+from garat_jax.methods.recorded import (
+    Paths,
+    Steps,
+    clone,
+    nearest_command,
+    needed_change,
+    path_error,
+)
 from garat_jax.runs import RunDirectory
 from tests import models
 from tests.probe_envs import Hang
@@ -68,6 +77,46 @@ def test_control_steps_hold_the_mean_command_and_never_cross_a_gap(read):
     np.testing.assert_allclose(steps.next_state - steps.state, [[0.02, 0.04]] * 3)
     # 10 ms of command 0, then 10 ms of 1; 20 ms of 1; 10 ms of 2, then 10 ms of 3.
     np.testing.assert_allclose(steps.action[:, 0], [0.5, 1.0, 2.5], atol=1e-12)
+
+
+def test_control_paths_are_steps_that_follow_each_other(read):
+    (recording,) = [irregular(read)]
+    paths = control_paths([recording], 0.02, 2)
+    np.testing.assert_allclose(paths.start[:, 0], [0.0, 0.01])
+    np.testing.assert_allclose(paths.state[..., 0], [[0.02, 0.04], [0.03, 0.05]])
+    np.testing.assert_allclose(paths.action[..., 0], [[0.5, 1.5], [1.0, 2.5]], atol=1e-12)
+    assert longest_path([recording], 0.02) == 2
+    assert longest_path([recording], 0.2) == 1
+
+
+def test_the_error_of_a_path_is_how_far_the_commands_lead_from_it(read):
+    model, recordings = read
+    bounds = choose_bounds(model, recordings)
+    paths = Paths(*(x[::9] for x in control_paths(recordings, bounds.interval, 5)))
+    env, world = make_source(model, paths.start, np.zeros(2), bounds, 0.5)
+
+    @jax.jit
+    def error(world, push, weight):
+        starts = jax.vmap(env.at, (None, 0))(world, jnp.asarray(paths.start, jnp.float32))
+        pushed = paths._replace(action=paths.action + push)
+        return path_error(env, world, starts, pushed, weight)
+
+    only_angle, only_speed = jnp.asarray([1.0, 0.0]), jnp.asarray([0.0, 1.0])
+    angle, speed = error(world, 0.0, only_angle), error(world, 0.0, only_speed)
+    both = error(world, 0.0, 4 * (only_angle + only_speed))
+    np.testing.assert_allclose(both, 2 * np.hypot(angle, speed), rtol=1e-5)
+    assert error(world, 0.5, only_speed) > 2 * speed
+    assert error(world, 0.0, jnp.inf * (only_angle + only_speed)) == LARGEST
+
+
+def test_networks_see_the_same_after_a_turn_of_a_joint_without_a_limit(read):
+    model, recordings = read
+    bounds = choose_bounds(model, recordings)
+    free, _ = make_source(model, np.zeros((1, 2)), np.zeros(2), bounds, 0.5)
+    obs = jnp.asarray([0.7, -1.0])
+    np.testing.assert_allclose(free.features(obs), [np.sin(0.7), -1.0, np.cos(0.7)], rtol=1e-6)
+    turned = free.features(obs + jnp.asarray([2 * np.pi, 0.0]))
+    np.testing.assert_allclose(turned, free.features(obs), atol=1e-6)
 
 
 def test_recordings_shorter_than_a_step_are_refused(read):
@@ -203,6 +252,59 @@ def test_a_run_holds_what_scripts_read(grounded):
     page = (grounded / "report.html").read_text()
     assert "With the action transformer the held-out error" in page
     assert "One control step at a time" in page
+
+
+def test_the_update_that_strays_least_is_taken(grounded):
+    summary = json.loads((grounded / "summary.json").read_text())
+    chosen = summary["chosen"]
+    lines = [json.loads(line) for line in (grounded / "metrics.jsonl").read_text().splitlines()]
+    errors = [chosen["path_error_of_model"], *(line["path_error"][0] for line in lines)]
+    assert chosen["update"] == np.argmin(errors) > 0
+    assert chosen["path_error"] == pytest.approx(min(errors))
+    assert summary["transition_error"]["grounded"] == lines[chosen["update"] - 1]["error"][0]
+
+
+def test_a_transformer_that_is_worse_than_none_is_not_taken(read, tmp_path):
+    untrained = dataclasses.replace(
+        SMALL, num_updates=1, learner=dataclasses.replace(SMALL.learner, learning_rate=0.0)
+    )
+    run = RunDirectory.create(tmp_path, {}, "test", [0])
+    done = ground(*read, untrained, run)
+    assert done.model.transform is None
+    assert done.summary["chosen"]["update"] == 0
+    assert "which stays as it is" in done.sentence
+    assert done.comparison.also[0].error == done.comparison.error.before
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (
+            {"error": {"grounded": 0.2, "model": 0.1}},
+            "rises from 10 % to 20 %; the model is better",
+        ),
+        ({"chosen": {"update": 0}}, "no action transformer was better than none"),
+        ({}, ""),
+    ],
+)
+def test_reading_a_run_says_when_the_model_is_better_without(grounded, tmp_path, changed, said):
+    root = shutil.copytree(grounded, tmp_path / "run")
+    summary = json.loads((root / "summary.json").read_text())
+    summary["error"] = {"grounded": 0.1, "model": 0.2}
+    (root / "summary.json").write_text(json.dumps(summary | changed))
+    lines = []
+    model = load_grounded(root, {"gat": SMALL}, say=lines.append)
+    assert (model.transform is None) == ("chosen" in changed)
+    assert len(lines) == bool(said)
+    assert said in "".join(lines)
+
+
+def test_a_run_of_another_version_is_refused(grounded, tmp_path):
+    root = shutil.copytree(grounded, tmp_path / "run")
+    summary = json.loads((root / "summary.json").read_text())
+    (root / "summary.json").write_text(json.dumps(summary | {"format": "garat-ground/1"}))
+    with pytest.raises(UserError, match="written by another version"):
+        load_grounded(root, {"gat": SMALL})
 
 
 def test_a_run_is_read_back(grounded):

@@ -14,7 +14,7 @@ from garat_jax.methods.garat import (
     GARAT,
     GARATConfig,
     Normaliser,
-    features,
+    evidence,
     gradient_penalty,
     weight_penalty,
 )
@@ -138,9 +138,9 @@ def test_gradient_penalty_is_taken_between_the_batches():
 
 def test_features_are_normalised_changes():
     normaliser = Normaliser(jnp.asarray([1.0, 0.0, 0.5]), jnp.asarray([2.0, 1.0, 0.1]))
-    seen = features(normaliser, jnp.asarray([3.0]), jnp.asarray([0.5]), jnp.asarray([3.4]))
+    seen = evidence(ENV, normaliser, jnp.asarray([3.0]), jnp.asarray([0.5]), jnp.asarray([3.4]))
     np.testing.assert_allclose(seen, [1.0, 0.5, -1.0], rtol=1e-5)
-    far = features(normaliser, jnp.asarray([3.0]), jnp.asarray([0.5]), jnp.asarray([99.0]))
+    far = evidence(ENV, normaliser, jnp.asarray([3.0]), jnp.asarray([0.5]), jnp.asarray([99.0]))
     assert far[2] == 10
 
 
