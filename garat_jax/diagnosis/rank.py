@@ -295,6 +295,8 @@ def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:
 def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):
     """Replace the best contender where a refinement, or more of its law, certainly explains more.
 
+    Its other names go with it: what replaces it has names of its own.
+
     Screening prefers the simpler law. A refinement's threshold hides it there; one without waits
     for the next round, where other effects rival it, if the simpler law proves itself.
     """
@@ -314,7 +316,8 @@ def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Fl
             break
         for contender in find(best, contenders):
             if leads(problem, contender.fit, best.fit):
-                replaced = (best.score.effect, contender.score.effect)
+                names = [c for c in contenders if c.fit.residual is best.fit.residual]
+                replaced = {contender.score.effect, *(c.score.effect for c in names)}
                 others = (c for c in contenders if c.score.effect not in replaced)
                 contenders, best = [contender, *others], contender
     return contenders

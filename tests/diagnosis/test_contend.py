@@ -5,7 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from garat_jax.diagnosis import rank
 from garat_jax.diagnosis.contend import fit_contenders, with_twins
+from garat_jax.diagnosis.findings import Interval
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import settle
@@ -45,3 +47,17 @@ def test_what_the_integrator_treats_otherwise_has_a_fit_of_its_own():
     (one, other), said = contenders_of("Euler")
     assert len(said) == 2
     assert other.fit.residual is not one.fit.residual
+
+
+def test_the_names_of_a_fit_go_where_more_of_its_law_explains_more(monkeypatch):
+    (one, other), _ = contenders_of("implicitfast")
+    fuller = dataclasses.replace(
+        one, fit=dataclasses.replace(one.fit, residual=one.fit.residual / 2)
+    )
+    monkeypatch.setattr(rank, "is_above", lambda *_: True)
+    monkeypatch.setattr(rank, "held_out_gain", lambda *_: Interval(0.0, 0.0, 0.0))
+    monkeypatch.setattr(rank, "fit_refinements", lambda *_: [])
+    monkeypatch.setattr(rank, "fit_further", lambda *_: [fuller])
+    monkeypatch.setattr(rank, "leads", lambda *_: True)
+    (kept,) = rank._refine(None, None, None, [], [one, other], None, print)
+    assert kept is fuller
