@@ -84,9 +84,9 @@ class Transfer:
     """Work with other processes, started alike, on the devices of all."""
     coordinator: Annotated[str | None, arg(metavar="HOST:PORT")] = None
     """Process 0; JAX_COORDINATOR_ADDRESS, Slurm or MPI by default."""
-    num_processes: int | None = None
+    num_processes: Annotated[int | None, arg(metavar="INT")] = None
     """How many processes; JAX_NUM_PROCESSES, Slurm or MPI by default."""
-    process_id: int | None = None
+    process_id: Annotated[int | None, arg(metavar="INT")] = None
     """Which of them, from 0; JAX_PROCESS_ID, Slurm or MPI by default."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder for the results; runs/PAIR-METHOD by default."""

@@ -30,7 +30,7 @@ SECONDS = 1.25
 BATCH = 64
 BATCHES = (1, BATCH)
 """Simulations side by side."""
-NUM_STEPS, NUM_SUBSTEPS = 20, 10
+NUM_STEPS, NUM_SUBSTEPS = 50, 4
 """Control steps in one call of a program, and physics steps in each: as many as in most tasks. A
 call of C MuJoCo, which is what it costs beside physics, is one a control step."""
 ENGINES = ("mujoco", "mjx")

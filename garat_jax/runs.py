@@ -24,7 +24,7 @@ FORMAT = "garat-run/1"
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
 CONTENTS = ".contents"
-"""Names of what the run has written, a line each: anything else in its folder is the user's."""
+"""Names at the top of the folder that the run has written, a line each: others are the user's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,14 +57,15 @@ class RunDirectory:
             config: A dataclass or mapping with the settings that decide the results.
             command: The command line that started the run.
             seeds: The seeds of the run.
-            force: Replace the folder if it holds an earlier run.
+            force: Replace the folder if it holds an earlier run and nothing that the run did not
+                write; hidden files and what lies in its folders are not looked at.
             resume: Go on with the run that the folder holds; start one if it is absent or empty.
                 None if the command cannot go on with a run.
 
         Raises:
             UserError: The folder is not empty and neither `force` nor `resume` was given, it holds
-                something else than a run, or `resume` was given and the run in it has other
-                settings or seeds.
+                something else than a run, or more than that, or `resume` was given and the run in
+                it has other settings or seeds.
         """
         if force and resume:
             raise UserError(
@@ -138,9 +139,9 @@ class RunDirectory:
     def path(self, name: str) -> Path:
         """Return the path of a file in the run, and make the folder that it belongs to."""
         path = self.root / name
-        top = path.relative_to(self.root).parts[0]
-        if not (self.root / top).exists():
-            with (self.root / CONTENTS).open("a", encoding="utf-8") as file:
+        contents, top = self.root / CONTENTS, Path(name).parts[0]
+        if not (self.root / top).exists() and (contents.exists() or name == CONFIG):
+            with contents.open("a", encoding="utf-8") as file:
                 file.write(top + "\n")
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
@@ -291,7 +292,7 @@ def _holds_results(root: Path) -> bool:
 def _is_occupied(root: Path) -> bool:
     if root.exists() and not root.is_dir():
         raise UserError(f"{root} is a file; expected a folder for the run")
-    return root.is_dir() and any(root.iterdir())
+    return root.is_dir() and any(path.name != CONTENTS for path in root.iterdir())
 
 
 def _check_same_run(root: Path, record: Mapping[str, Any]) -> None:
@@ -328,13 +329,16 @@ def _check_replaceable(root: Path) -> None:
         raise UserError(
             f"{root} is not empty and holds no run, so it is left alone; give another --out"
         )
-    contents = root / CONTENTS
-    written = contents.read_text(encoding="utf-8").splitlines() if contents.exists() else []
-    if others := sorted({p.name for p in root.glob("[!.]*")} - set(written)):
+    contents, names = root / CONTENTS, {path.name for path in root.glob("[!.]*")}
+    written = contents.read_text(encoding="utf-8").splitlines() if contents.exists() else names
+    if others := sorted(names.difference(written)):
         raise UserError(
             f"{root} holds {', '.join(others)}, which the run in it did not write, so it is left "
             "alone; move that away or give another --out"
         )
+    for part in root.iterdir():
+        if is_run(part):
+            _check_replaceable(part)
     if Path.cwd().resolve().is_relative_to(root.resolve()):
         raise UserError(
             f"{root} is the current folder or holds it, so it is left alone; "

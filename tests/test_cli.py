@@ -50,6 +50,8 @@ def test_help_of_a_command_explains_every_option(name):
     for field in dataclasses.fields(cli.COMMANDS[name]):  # pyright: ignore[reportArgumentType]
         positional = field.name.upper() in done.stdout
         assert positional or f"--{field.name.replace('_', '-')}" in done.stdout
+    assert "default: None" not in done.stdout
+    assert "default: )" not in done.stdout
 
 
 def test_version():

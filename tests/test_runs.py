@@ -117,6 +117,24 @@ def test_force_leaves_a_run_alone_to_which_a_user_has_added_a_file(tmp_path):
     assert len(list(run.metrics())) == 1
 
 
+def test_force_leaves_alone_what_a_user_has_added_to_a_run_within_a_run(tmp_path):
+    inner = create(create(tmp_path).path("part"))
+    create(tmp_path, seeds=[7], force=True)
+    inner = create(RunDirectory(tmp_path).path("part"))
+    (inner.root / "thesis.tex").write_text("years of work")
+    with pytest.raises(UserError, match=r"part holds thesis\.tex"):
+        create(tmp_path, force=True)
+
+
+def test_a_run_that_did_not_note_what_it_wrote_is_replaced_as_a_whole(tmp_path):
+    run = create(tmp_path)
+    run.log(1, loss=1.0)
+    (tmp_path / ".contents").unlink()
+    create(tmp_path, resume=True).write_json("summary.json", {})
+    assert not (tmp_path / ".contents").exists()
+    assert list(create(tmp_path, force=True).metrics()) == []
+
+
 def test_force_leaves_the_target_of_a_link_alone(tmp_path):
     create(tmp_path / "run")
     (tmp_path / "link").symlink_to(tmp_path / "run")

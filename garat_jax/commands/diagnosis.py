@@ -19,7 +19,7 @@ class OnRecordings:
     model: Annotated[Positional[Path], arg(metavar="MODEL")]
     """MJCF (.xml) or model card (.toml)."""
     data: Annotated[Positional[tuple[Path, ...]], arg(metavar="DATA...")]
-    """Recordings (CSV, Parquet or NPZ), one a file."""
+    """One recording or more (CSV, Parquet or NPZ), one a file."""
     map: Annotated[Path | None, arg(metavar="MAP.toml")] = None
     """How the recordings' columns are named, and in which units."""
     effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
@@ -166,7 +166,7 @@ class Ground(WithHoldout):
     """Learn what physics does not explain: an action transformer of a model, from recordings.
 
     It writes DIR/summary.json, the transformer's checkpoint, the model and DIR/report.html; `garat
-    compare --grounded DIR` scores it beside other models. A repaired model leaves less to learn.
+    compare --grounded DIR` scores it beside other models.
     """
 
     method: str = "gat"

@@ -28,8 +28,8 @@ from garat_jax.methods.recorded import (
     as_recorded,
     as_transitions,
     clone,
+    cloned,
     exploring,
-    nearest_command,
     needed_change,
     path_error,
 )
@@ -119,6 +119,13 @@ class Best(NamedTuple):
     update: jax.Array
     updates: jax.Array
 
+    def after(self, state: Any, transformer: Params, error: jax.Array) -> "Best":
+        """Return the best after one more update, which made a transformer with an error."""
+        updates = self.updates + 1
+        choose = functools.partial(jnp.where, error < self.error)
+        kept = jax.tree.map(choose, transformer, self.transformer)
+        return Best(state, kept, choose(error, self.error), choose(updates, self.update), updates)
+
 
 def ground(
     model: Model,
@@ -156,15 +163,17 @@ def ground(
     unseen = draw(control_steps(held_out, bounds.interval), config.num_held_out, rng)
     deviation = np.sqrt(np.mean([noise(r) ** 2 for r in fitted], axis=0))
     env, world = make_source(model, seen.state, deviation, bounds, config.episode)
-    agent, agent_params = (nearest_command, clone(seen)) if policy is None else (policy, ())
+    agent, agent_params = (cloned(env), clone(env, seen)) if policy is None else (policy, ())
     trainer = Trainer(run, [seed])
     say(f"learning an action transformer with {config.method}")
     num_steps = max(1, round(config.episode / bounds.interval))
     num_steps = min(num_steps, longest_path(fitted, bounds.interval))
-    paths = draw(control_paths(fitted, bounds.interval, num_steps), MOST_PATHS, rng)
+    every = max(1, sum(len(r.time) for r in fitted) // (10 * MOST_PATHS))
+    paths = control_paths(fitted, bounds.interval, num_steps, every)
+    paths = draw(paths, MOST_PATHS, rng)
     spread = metric_spread(paths.state.reshape(-1, env.obs_size), deviation)
     measured = np.arange(env.obs_size) < env.num_position
-    measured |= any(r.velocity_measured for r in fitted)
+    measured |= all(r.velocity_measured for r in fitted)
     weight = jnp.asarray(measured / measured.mean() / spread**2, jnp.float32)
     lesson = Lesson(env, world, agent, agent_params, seen, unseen, paths, weight)
     reach = _choose_reach(lesson, trainer)
@@ -238,10 +247,7 @@ def _learn(lesson: Lesson, config: GroundConfig, reach: float, trainer: Trainer)
         grounding = Grounding(world, transformer)
         error, faulty = transition_error(grounded, grounding, recorded)
         path = path_error(grounded, grounding, starts, paths, weight)
-        updates = best.updates + 1
-        choose = functools.partial(jnp.where, path < best.error)
-        kept = jax.tree.map(choose, transformer, best.transformer)
-        best = Best(state, kept, choose(path, best.error), choose(updates, best.update), updates)
+        best = best.after(state, transformer, path)
         told = {"error": error, "error_ratio": error / errors["source"], f"error_{FAULTY}": faulty}
         return best, metrics | told | {"path_error": path}
 

@@ -134,8 +134,8 @@ def _write_report(run: RunDirectory, done: Grounded, name: str) -> None:
             Section(
                 "Which update was taken",
                 f"Recorded commands are replayed for {1000 * interval * chosen['steps']:.3g} ms "
-                f"from {chosen['paths']} of the states that the transformer was learned from. The "
-                "error is how far the state strays, as a share of the signals' spread. The "
+                f"from {chosen['paths']} states in the recordings that the transformer was learned "
+                "from. The error is how far the state strays, as a share of the signals' spread. "
                 + _chosen(chosen["update"]),
                 figures=[
                     Figure(
@@ -166,8 +166,8 @@ def _write_report(run: RunDirectory, done: Grounded, name: str) -> None:
 
 def _chosen(update: int) -> str:
     if update == 0:
-        return "model without a transformer strays least, so none is used."
-    return f"transformer of update {update} strays least, and is the one that is used."
+        return "The model without a transformer strays least, so none is used."
+    return f"The transformer of update {update} strays least, and is the one that is used."
 
 
 def _curve(

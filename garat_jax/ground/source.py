@@ -15,7 +15,7 @@ from garat_jax.dynamics import Dynamics, Override
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.errors import UserError, choose
 from garat_jax.ground.steps import Bounds
-from garat_jax.methods.recorded import RecordedEnv, Steps, as_transitions, clone, nearest_command
+from garat_jax.methods.recorded import RecordedEnv, Steps, as_transitions, clone, cloned
 from garat_jax.runs import RunDirectory
 from garat_jax.transfer import GroundConfig, make_method
 
@@ -74,11 +74,12 @@ def load_grounded(
         say(f"{root}: no action transformer was better than none; this is the model as it is")
         return model
     error = summary["error"]
-    if error["grounded"] > error["model"]:
+    if error["grounded"] is None or error["grounded"] > error["model"]:
+        reached = error["grounded"]
+        reached = "no number" if reached is None else f"{100 * reached:.3g} %"
         say(
             f"{root}: with its action transformer the held-out error rises from "
-            f"{100 * error['model']:.3g} % to {100 * error['grounded']:.3g} %; "
-            "the model is better without"
+            f"{100 * error['model']:.3g} % to {reached}; the model is better without"
         )
     control = summary["control"]
     bounds = Bounds(control["interval"], np.asarray(control["low"]), np.asarray(control["high"]))
@@ -87,9 +88,9 @@ def load_grounded(
     start[0, : host.nq] = host.qpos0
     env, world = make_source(model, start, 0 * start[0], bounds, summary["episode"])
     steps = Steps(start, np.zeros((1, host.nu)), start)
-    method = make_method(env, nearest_command, config.reaching(summary["reach"]))
+    method = make_method(env, cloned(env), config.reaching(summary["reach"]))
     shapes = jax.eval_shape(
-        method.init, jax.random.key(0), world, clone(steps), as_transitions(env, steps)
+        method.init, jax.random.key(0), world, clone(env, steps), as_transitions(env, steps)
     )
     like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes.transformer.policy)
     transformer = checkpoint.restore(root / TRANSFORMER, like)

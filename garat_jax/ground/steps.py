@@ -80,8 +80,10 @@ def control_steps(recordings: Sequence[Recording], interval: float) -> Steps:
     return Steps(start, action[:, 0], state[:, 0])
 
 
-def control_paths(recordings: Sequence[Recording], interval: float, length: int) -> Paths:
-    """Cut recordings into paths of control steps, one from each sample on.
+def control_paths(
+    recordings: Sequence[Recording], interval: float, length: int, every: int = 1
+) -> Paths:
+    """Cut recordings into paths of control steps, one from each sample on, or from fewer.
 
     The command of a step is the mean of those held during it; its end is interpolated between
     samples where there is none. There may be no path at all.
@@ -90,6 +92,7 @@ def control_paths(recordings: Sequence[Recording], interval: float, length: int)
         recordings: What was measured.
         interval: Seconds of a step.
         length: Steps of a path.
+        every: Samples from the start of a path to that of the next.
     """
     parts = []
     for recording in recordings:
@@ -97,7 +100,8 @@ def control_paths(recordings: Sequence[Recording], interval: float, length: int)
             time, state = recording.time[a:b], _state(recording)[a:b]
             held = np.diff(time)[:, None] * recording.ctrl[a : b - 1]
             integral = np.concatenate([np.zeros((1, held.shape[1])), np.cumsum(held, axis=0)])
-            starts = time + length * interval <= time[-1] + 1e-6 * interval
+            starts = np.flatnonzero(time + length * interval <= time[-1] + 1e-6 * interval)
+            starts = starts[::every]
             at = time[starts, None] + interval * np.arange(length + 1)
             travelled = np.diff(_interpolate(at, time, integral), axis=1)
             ends = _interpolate(at[:, 1:], time, state)

@@ -141,33 +141,37 @@ class RecordedEnv(Env):
 
 
 class Clone(NamedTuple):
-    """Parameters of `nearest_command`: states by their spread [N, nq + nv], commands [N, nu]."""
+    """Parameters of `cloned`: states' features by their spread [N, features], commands [N, nu]."""
 
     state: jax.Array
     spread: jax.Array
     action: jax.Array
 
 
-def clone(steps: Steps) -> Clone:
-    """Return the parameters with which `nearest_command` acts as recorded in steps in any order."""
+def clone(env: Env, steps: Steps) -> Clone:
+    """Return the parameters with which `cloned(env)` acts as recorded in steps in any order."""
     steps = Steps(*(column[:MOST_STATES] for column in steps))
-    spread = steps.state.std(axis=0) + 1e-6
-    return Clone(
-        *(jnp.asarray(x, jnp.float32) for x in (steps.state / spread, spread, steps.action))
-    )
+    seen = np.asarray(env.features(jnp.asarray(steps.state)))
+    spread = seen.std(axis=0) + 1e-6
+    return Clone(*(jnp.asarray(x, jnp.float32) for x in (seen / spread, spread, steps.action)))
 
 
-def nearest_command(params: Clone, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def cloned(env: Env) -> Policy:
     """Behaviour cloning without training: act as in one of the nearest recorded states, drawn.
 
-    A `Policy`. It keeps commands within those recorded and follows a command that jumps, where a
-    regression would average. Nearest neighbours in place of a network: Pari et al. 2021
-    (arXiv 2112.01511), there of images.
+    It keeps commands within those recorded and follows a command that jumps, where a regression
+    would average. Nearest neighbours in place of a network: Pari et al. 2021 (arXiv 2112.01511),
+    there of images.
     """
-    distance = jnp.sum(jnp.square(params.state - obs / params.spread), axis=1)
-    _, nearest = jax.lax.top_k(-distance, min(NEIGHBOURS, params.state.shape[0]))
-    drawn = jax.random.randint(key, (), 0, nearest.shape[0])
-    return params.action[nearest[drawn]], jnp.zeros(())
+
+    def act(params: Clone, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        seen = env.features(obs) / params.spread
+        distance = jnp.sum(jnp.square(params.state - seen), axis=1)
+        _, nearest = jax.lax.top_k(-distance, min(NEIGHBOURS, params.state.shape[0]))
+        drawn = jax.random.randint(key, (), 0, nearest.shape[0])
+        return params.action[nearest[drawn]], jnp.zeros(())
+
+    return act
 
 
 def exploring(env: Env, policy: Policy, scale: float) -> Policy:
@@ -220,7 +224,7 @@ def path_error(
         weight: What a squared error of each signal counts, [nq + nv].
 
     Returns:
-        The root mean square of the weighted errors, []; `LARGEST` if it is not finite.
+        The root mean square of the weighted errors, [], `LARGEST` at most and if not finite.
     """
     key = jax.random.key(0)  # nothing draws
 
@@ -233,7 +237,7 @@ def path_error(
     action, state = (jnp.swapaxes(jnp.asarray(x, jnp.float32), 0, 1) for x in paths[1:])
     _, squares = jax.lax.scan(advance, starts, (action, state))
     error = jnp.sqrt(squares.mean())
-    return jnp.where(jnp.isfinite(error), error, LARGEST)
+    return jnp.where(jnp.isfinite(error), jnp.minimum(error, LARGEST), LARGEST)
 
 
 def as_transitions(env: Env, steps: Steps) -> Transition:

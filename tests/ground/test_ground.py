@@ -18,15 +18,13 @@ from garat_jax.effects import CATALOGUE
 from garat_jax.env import LARGEST
 from garat_jax.errors import UserError
 from garat_jax.ground import GroundConfig, ground, load_grounded
+from garat_jax.ground.learn import Best
 from garat_jax.ground.run import load_policy
 from garat_jax.ground.source import make_source
 from garat_jax.ground.steps import choose_bounds, control_paths, control_steps, longest_path
 from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.recorded import (
     Paths,
-    Steps,
-    clone,
-    nearest_command,
     needed_change,
     path_error,
 )
@@ -109,16 +107,6 @@ def test_the_error_of_a_path_is_how_far_the_commands_lead_from_it(read):
     assert error(world, 0.0, jnp.inf * (only_angle + only_speed)) == LARGEST
 
 
-def test_networks_see_the_same_after_a_turn_of_a_joint_without_a_limit(read):
-    model, recordings = read
-    bounds = choose_bounds(model, recordings)
-    free, _ = make_source(model, np.zeros((1, 2)), np.zeros(2), bounds, 0.5)
-    obs = jnp.asarray([0.7, -1.0])
-    np.testing.assert_allclose(free.features(obs), [np.sin(0.7), -1.0, np.cos(0.7)], rtol=1e-6)
-    turned = free.features(obs + jnp.asarray([2 * np.pi, 0.0]))
-    np.testing.assert_allclose(turned, free.features(obs), atol=1e-6)
-
-
 def test_recordings_shorter_than_a_step_are_refused(read):
     with pytest.raises(UserError, match=r"no recording has 3 s in a row; .* smaller --interval"):
         control_steps(read[1], 3.0)
@@ -173,18 +161,6 @@ def test_the_needed_change_of_a_command_is_the_hidden_torque(read, recorded):
     env, world = make_source(model, steps.state, np.asarray([1e-3, 1e-2]), bounds, 0.5)
     change = jax.jit(lambda w: needed_change(env, w, steps))(world)
     assert change == pytest.approx(abs(recorded[2]), rel=0.25)  # noise is in it
-
-
-def test_the_cloned_policy_does_what_was_done_in_a_state_nearby():
-    rng = np.random.default_rng(0)
-    state = rng.uniform(-1, 1, (500, 2)) * [1.0, 100.0]
-    action = np.sign(state[:, :1])  # a switch: a mean would be neither
-    params = clone(Steps(state, action, state))
-    keys = jax.random.split(jax.random.key(0), 50)
-    for angle, wanted in ((0.5, 1.0), (-0.5, -1.0)):
-        obs = np.asarray([angle, 30.0], np.float32)
-        drawn, _ = jax.vmap(nearest_command, (None, None, 0))(params, obs, keys)
-        assert (drawn == wanted).all()
 
 
 def test_a_transform_acts_before_the_model_as_its_equal_effect(read, recorded):
@@ -262,6 +238,14 @@ def test_the_update_that_strays_least_is_taken(grounded):
     assert chosen["update"] == np.argmin(errors) > 0
     assert chosen["path_error"] == pytest.approx(min(errors))
     assert summary["transition_error"]["grounded"] == lines[chosen["update"] - 1]["error"][0]
+
+
+def test_the_best_of_the_updates_stays():
+    best = Best(0, {"w": jnp.zeros(2)}, jnp.asarray(5.0), jnp.asarray(0), jnp.asarray(0))
+    for number, error in enumerate([6.0, 2.0, 3.0], start=1):
+        best = best.after(number, {"w": jnp.full(2, 1.0 * number)}, jnp.asarray(error))
+    assert (best.state, best.error, best.update, best.updates) == (3, 2.0, 2, 3)
+    np.testing.assert_array_equal(best.transformer["w"], [2.0, 2.0])
 
 
 def test_a_transformer_that_is_worse_than_none_is_not_taken(read, tmp_path):
