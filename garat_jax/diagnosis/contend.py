@@ -24,6 +24,8 @@ SAME = 1.0 - 1e-9
 FIRM = 2.0
 """Half-widths of its 95 % interval by which a parameter that screening left out must differ from no
 effect, at a timestep of 0, to be fitted in the end."""
+SHOWN = 0.01
+"""Largest corrected p-value of what a refinement changes beside the law that it refines."""
 HOPELESS = 8.0
 """What a candidate is expected to leave unexplained, relative to what the best one left when it was
 fitted, above which it is not fitted; the runner-up always is."""
@@ -45,25 +47,30 @@ class Contender:
 
 
 def fit_contenders(
-    problem: Problem, current: Fit, scores: Sequence[Score], say: Callable[[str], None]
+    problem: Problem,
+    current: Fit,
+    refinable: Sequence[int],
+    scores: Sequence[Score],
+    say: Callable[[str], None],
 ) -> list[Contender]:
     """Fit the candidates that may be the missing effect.
 
     Args:
         problem: The recordings and the model with every candidate.
         current: The fit of the effects selected so far.
+        refinable: Indices of those of them in whose place a refinement may come.
         scores: What screening says, best first.
         say: Told what is being done.
     """
+    contenders = _fit_instead(problem, current, refinable, scores, say)
+    done = {c.score.effect for c in contenders}
     likely = [s for s in scores if not s.excluded and s.possible and s.share > 0.02]
+    likely = [s for s in likely if s.effect not in done]
     likely = [s for s in likely if s.share > 0.25 * likely[0].share]
     likely = [s for s in likely if not simpler_law(problem, s, likely)]
     likely = [s for i, s in enumerate(likely) if not twins(s, likely[:i])]
-    if not likely:
-        return []
     chosen = likely[:CONTENDERS]
     chosen += [s for s in likely[CONTENDERS:] if cosine(s, likely[0]) > EQUIVALENT]
-    contenders: list[Contender] = []
     for score in chosen:
         rival = min((c.fit.cost[problem.fitted].sum() for c in contenders), default=np.inf)
         hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
@@ -94,31 +101,64 @@ def fit_refinements(
         say: Told what is being done.
         hidden_only: Leave out the laws that screening sees, because they have no threshold.
     """
-    effects = problem.simulator.effects
-    simple = effects[best.score.effect]
-    none = simple.at(problem.simulator.host, simple.target)
-    own = columns_of(problem.simulator.slots, best.score.effect)
+    simulator, simple = problem.simulator, best.score.effect
+    none = simulator.effects[simple].at(simulator.host, simulator.effects[simple].target)
+    own = columns_of(simulator.slots, simple)
     if any(current.theta[j] != none[name] for name, j in own.items()):
         return []
-    theta = [float(value) for value in best.fit.theta]
-    (found,) = problem.simulator.with_parameters(theta, [best.score.effect])
     rival = best.fit.cost[problem.fitted].sum()
-    contenders = []
+    return [
+        _fit(problem, current, score, rival, say)
+        for score in _refining(problem, best.fit.theta, simple, scores)
+        if not hidden_only or problem.num_listed(score.effect) > 1
+    ]
+
+
+def _fit_instead(
+    problem: Problem,
+    current: Fit,
+    held: Sequence[int],
+    scores: Sequence[Score],
+    say: Callable[[str], None],
+) -> list[Contender]:
+    """Fit the laws that refine those of effects selected before, each in the place of the simpler.
+
+    Beside what was found since, or over longer segments, the difference may show. Those are fitted
+    of which screening says that they change something that the simpler law leaves, whatever sign.
+
+    Args:
+        problem: The recordings and the model with every candidate.
+        current: The fit of the effects selected so far.
+        held: Their indices.
+        scores: What screening says.
+        say: Told what is being done.
+    """
+    found = []
+    for simple in held:
+        own = list(columns_of(problem.simulator.slots, simple).values())
+        theta = current.theta.copy()
+        theta[own] = problem.simulator.base[own]
+        free = tuple(j for j in current.free if j not in own)
+        rest = dataclasses.replace(current, theta=theta, free=free)
+        for score in _refining(problem, current.theta, simple, scores):
+            if score.p_value < SHOWN and not score.excluded:
+                found.append(_fit(problem, rest, score, np.inf, say))
+    return found
+
+
+def _refining(problem: Problem, theta: np.ndarray, simple: int, scores: Sequence[Score]):
+    """Return the scores of laws that refine another at its place, to begin as it was fitted."""
+    simulator, found = problem.simulator, []
+    (law,) = simulator.with_parameters([float(value) for value in theta], [simple])
     for score in scores:
-        law = effects[score.effect]
-        if law.target != simple.target or simple.kind not in law.refines:
+        finer = simulator.effects[score.effect]
+        if finer.target != law.target or law.kind not in finer.refines:
             continue
-        has_threshold = problem.num_listed(score.effect) > 1
-        if hidden_only and not has_threshold:
-            continue
-        alike = type(law).refined_from(found)
-        if not alike:
-            continue
-        columns = columns_of(problem.simulator.slots, score.effect)
-        start = {columns[name]: value for name, value in alike.items()}
-        score = dataclasses.replace(score, columns=tuple(start), start=start)
-        contenders.append(_fit(problem, current, score, rival, say))
-    return contenders
+        if alike := type(finer).refined_from(law):
+            columns = columns_of(simulator.slots, score.effect)
+            start = {columns[name]: value for name, value in alike.items()}
+            found.append(dataclasses.replace(score, columns=tuple(start), start=start))
+    return found
 
 
 def fit_further(problem: Problem, best: Contender, say: Callable[[str], None]) -> list[Contender]:
@@ -216,7 +256,7 @@ def _as_twin(problem: Problem, current: Fit, twin: Contender, like: Score, score
         like: What screening said of it.
         score: What it said of the other: the same, at the same sizes.
     """
-    names = _stands_for(problem, like, score)
+    names = stands_for(problem, like, score)
     if not names.keys() >= {*twin.score.columns}:
         return None
     columns = tuple(names[j] for j in twin.score.columns)
@@ -230,7 +270,7 @@ def _as_twin(problem: Problem, current: Fit, twin: Contender, like: Score, score
     return Contender(dataclasses.replace(score, columns=columns), fitted)
 
 
-def _stands_for(problem: Problem, one: Score, other: Score) -> dict[int, int]:
+def stands_for(problem: Problem, one: Score, other: Score) -> dict[int, int]:
     """Return which parameter of another law stands for which of one, by index."""
     effects, slots = problem.simulator.effects, problem.simulator.slots
     if effects[one.effect].kind != effects[other.effect].kind:

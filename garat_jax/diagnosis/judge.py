@@ -1,17 +1,15 @@
 """Hold fitted candidates against each other, and say which passes every gate."""
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, renamed, twins
+from garat_jax.diagnosis.contend import Contender, twins
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
 from garat_jax.diagnosis.problem import Problem, block_labels
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
 from garat_jax.diagnosis.starts import Fit
-from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.effects.units import unit_at
 
 SMALLEST_SHARE = 0.05
@@ -72,42 +70,12 @@ def judge(
         best = min(passing, key=lambda i: len(contenders[i].score.columns), default=order[0])
         judged = [found[best], *(found[i] for i in order if i != best)]
         judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
-        if judged[0][0].passes:
-            judged = _with_timestep(problem, metric, current, judged)
     fitted = [c.score.effect for c in contenders]
     why = "the model's error is near the noise floor" if not gap else "others explain more"
     rest = [score for score in scores if score.effect not in fitted]
     for score in rest:
         sign = "its sign is physically impossible" if not score.possible else why
         judged.append((_unfitted(problem, score, rest, score.excluded or sign), None))
-    return judged
-
-
-def _with_timestep(problem: Problem, metric: Metric, current: Fit, judged):
-    """Show the first candidate, and those like it, as a timestep of 0 would have them.
-
-    Candidates are held against each other, and added to, as they fit at the model's own. What is
-    one fit under two names is counted once.
-    """
-    shown = {judged[0][0].named, *judged[0][0].indistinguishable_from}
-    counted: list[tuple[Contender, Fit]] = []
-    for place, (candidate, contender) in enumerate(judged):
-        if candidate.named not in shown:
-            continue
-        same = [(c, f) for c, f in counted if c.fit.residual is contender.fit.residual]
-        if same:
-            twin, fit = same[0]
-            columns = twin.score.columns, contender.score.columns
-            fit = renamed(fit, *columns, without=current.theta)
-        else:
-            fit = count_timestep(problem, contender.fit)
-        candidate = dataclasses.replace(
-            candidate,
-            parameters=estimates(problem, contender.score.effect, fit),
-            error_after=metric.error(fit.residual, ~problem.fitted),
-        )
-        counted.append((contender, fit))
-        judged[place] = (candidate, dataclasses.replace(contender, timeless=fit))
     return judged
 
 

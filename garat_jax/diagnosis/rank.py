@@ -17,6 +17,8 @@ from garat_jax.diagnosis.contend import (
     fit_contenders,
     fit_further,
     fit_refinements,
+    renamed,
+    stands_for,
     with_evidence,
     with_twins,
 )
@@ -163,7 +165,9 @@ def explain(
     if steps:
         current = found.timeless or count_timestep(problem, current)
         steps[-1] = steps[-1]._replace(fit=current)
-    selected = tuple(_refreshed(problem, step, current) for step in steps)
+    shown = _as_shown(problem, steps, current)
+    selected = tuple(shown[step.candidate.named] for step in steps)
+    candidates = tuple(shown.get(c.named, c) for c in candidates)
     best = current if steps else found.best
     if not is_above(problem, make_metric(problem), current, found.floor):
         best = None
@@ -203,14 +207,15 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
             break
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}")
-        judged = _round(problem, metric, current, held, floor, say)
+        judged = _round(problem, metric, current, held, floor, say, refinable=held)
         judged, chosen = _look_ahead(problem, metric, current, judged, held, say)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         contender = judged[0][1] if judged else None
         best = contender.fit if contender is not None else best
         if not chosen:
             break
-        steps += chosen
+        free = {*chosen[-1].fit.free}  # of a law that was refined, nothing is free any more
+        steps = [*(s for s in steps if free & {*s.contender.score.columns}), *chosen]
         added = _completed(problem, [step.contender for step in steps], say)
         current = added.fit
         steps[-1] = steps[-1]._replace(fit=current)
@@ -223,11 +228,29 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
     return Selection(problem, steps, current, timeless, floor, first_round, best)
 
 
-def _round(problem: Problem, metric: Metric, current: Fit, held, floor: Floor, say) -> Judged:
-    """Screen the candidates, fit the likely ones and judge them all."""
+def _round(
+    problem: Problem,
+    metric: Metric,
+    current: Fit,
+    held: Sequence[int],
+    floor: Floor,
+    say: Callable[[str], None],
+    refinable: Sequence[int] = (),
+) -> Judged:
+    """Screen the candidates, fit the likely ones and judge them all.
+
+    Args:
+        problem: The recordings and the model with every candidate.
+        metric: Of the errors.
+        current: The fit of the effects selected so far.
+        held: Their indices.
+        floor: The noise floor.
+        say: Told what is being done.
+        refinable: Those of them in whose place a refinement may come.
+    """
     gap = is_above(problem, metric, current, floor)
     scores = screen(problem, current, held)
-    contenders = fit_contenders(problem, current, scores, say) if gap else []
+    contenders = fit_contenders(problem, current, refinable, scores, say) if gap else []
     contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
     contenders = _refine(problem, metric, current, scores, contenders, floor, say)
     contenders = with_twins(problem, current, scores, contenders, say)
@@ -339,6 +362,18 @@ def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
     return tuple(sorted(corrected, key=lambda c: kept.get(c.named, len(kept)) if dropped else 0))
 
 
-def _refreshed(problem: Problem, step: Step, final: Fit) -> Candidate:
-    """Return a selected effect with its parameters from the final fit."""
-    return dataclasses.replace(step.candidate, parameters=estimates(problem, step.effect, final))
+def _as_shown(problem: Problem, steps: Sequence[Step], final: Fit) -> dict[Named, Candidate]:
+    """Return the selected effects, and their other names, with what the final fit says of them."""
+    metric, shown = make_metric(problem), {}
+    for step in steps:
+        error = metric.error(step.fit.residual, ~problem.fitted)
+        for candidate, contender in [(step.candidate, step.contender), *step.alike]:
+            if contender.fit.residual is not step.contender.fit.residual:
+                continue
+            names = stands_for(problem, step.contender.score, contender.score)
+            fit = renamed(final, [*names], [*names.values()], without=problem.simulator.base)
+            found = estimates(problem, contender.score.effect, fit)
+            shown[candidate.named] = dataclasses.replace(
+                candidate, parameters=found, error_after=error
+            )
+    return shown

@@ -8,7 +8,7 @@ from garat_jax.diagnosis.differences import STEP, clear_differences, projected
 from garat_jax.diagnosis.fit import WIDE, fit, interval, uncertainty, wide
 from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels
 from garat_jax.diagnosis.robust import regress
-from garat_jax.diagnosis.starts import KEPT_PROMISE, Fit, follow
+from garat_jax.diagnosis.starts import KEPT_PROMISE, Fit, follow, start_step
 from garat_jax.diagnosis.surface import smooth_minimum
 
 EXTRAPOLATED = 0.1
@@ -17,6 +17,11 @@ one. It is as much more as half the shift does less, or more, than was promised 
 
 UNFELT = 0.1
 """Norm of what a shift is to change, in standard deviations of noise, below which it is none."""
+SHIFTS = 4
+"""Largest number of Gauss-Newton steps to a timestep of 0."""
+EXPLAINS_LESS = 1.1
+"""What would be left at a timestep of 0, relative to what the fit leaves, above which it cannot be
+extrapolated."""
 REFITTED = 24
 """Segments that are fitted again at least, at both timesteps."""
 
@@ -26,8 +31,9 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
 
     At the model's own timestep a parameter also makes up for the integrator's error, which may be
     many times the noise. Where halving the timestep does much less or more than sensitivities
-    promise, as across contacts, estimates stay, fits at both timesteps say how far they are from
-    those at 0, and their intervals reach as far. Where contacts make the cost rough, that of a
+    promise, or a timestep of 0 would explain less than the fit does, as across contacts, estimates
+    stay, fits at both timesteps say how far they are from those at 0, and their intervals reach as
+    far. Where contacts make the cost rough, that of a
     smooth surface counts; see `smooth_minimum`.
     """
     keep = np.asarray([j not in fitted.frozen for j in fitted.free], bool)
@@ -49,22 +55,71 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
         lin = lin._replace(residual=fitted.residual)
     halved = problem.integrator_error(theta, start, fitted.residual)
     near = lin._replace(start=fitted.sensitivity)
-    sensitivity, change = projected(problem, near._replace(residual=2.0 * halved))
-    labels = block_labels(problem)[problem.fitted].ravel()
-    moved = theta.copy()
-    moved[np.asarray(free)[keep]] += regress(sensitivity[:, keep], change, labels).coefficient
-    moved = problem.within_bounds(range(len(moved)), moved)
-    shift = (moved - theta)[list(free)]
+    shift = _step(problem, near._replace(residual=2.0 * halved), theta, free, keep)
     kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
-    if abs(1.0 - kept) > 1.0 - KEPT_PROMISE:
+    moved, left = _step_on(problem, near._replace(residual=2.0 * halved), fitted, shift, keep)
+    explains_less = _cost(problem, left) > EXPLAINS_LESS * _cost(problem, fitted.residual)
+    if abs(1.0 - kept) > 1.0 - KEPT_PROMISE or explains_less:
         low, high = _wider(interval(problem, theta, lin, free, keep), rough)
         shift = _shift_by_fits(problem, fitted)
         low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
         return dataclasses.replace(fitted, low=low, high=high)
-    timeless = lin._replace(residual=fitted.residual + 2.0 * halved)
-    low, high = _wider(interval(problem, moved, timeless, free, keep), rough)
-    unsure = max(EXTRAPOLATED, abs(1.0 - kept)) * np.abs(shift)
+    low, high = _wider(interval(problem, moved, lin._replace(residual=left), free, keep), rough)
+    unsure = max(EXTRAPOLATED, abs(1.0 - kept)) * np.abs((moved - theta)[list(free)])
     return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
+
+
+def _step(problem: Problem, lin: Linearisation, theta: np.ndarray, free, keep) -> np.ndarray:
+    """Return the change of the free parameters, within bounds, that lowers a residual most, [k]."""
+    sensitivity, residual = projected(problem, lin)
+    labels = block_labels(problem)[problem.fitted].ravel()
+    moved = theta.copy()
+    moved[np.asarray(free)[keep]] += regress(sensitivity[:, keep], residual, labels).coefficient
+    moved = problem.within_bounds(range(len(moved)), moved)
+    return (moved - theta)[list(free)]
+
+
+def _step_on(problem: Problem, change: Linearisation, fitted: Fit, shift: np.ndarray, keep):
+    """Take the step to a timestep of 0, and further ones as long as they lower what is left there.
+
+    The timestep's error may be so much larger than noise that one Gauss-Newton step does not undo
+    it. Steps undo what the timestep makes, not what was left by the fit.
+
+    Args:
+        problem: What is fitted.
+        change: What a timestep of 0 changes of the fit's residual, with the fit's sensitivities.
+        fitted: The fit.
+        shift: The first step of the free parameters, [k].
+        keep: Which of them are excited, [k] bool.
+
+    Returns:
+        The parameters there, [num_parameters], and the residual as it would be, [S, N].
+    """
+    free, unit = list(fitted.free), problem.segments.start_unit
+    theta, start, undamped = fitted.theta, fitted.start, np.zeros(len(fitted.start))
+    for _ in range(SHIFTS):
+        moved = theta.copy()
+        moved[free] += shift
+        expected = change.residual + change.parameters @ shift
+        starts = start + start_step(problem, change, expected, undamped, 0.0) * unit
+        there = 2.0 * _whitened(problem, problem.finer, moved, starts)
+        there -= _whitened(problem, problem.simulator, moved, starts)
+        if _cost(problem, there) >= _cost(problem, fitted.residual + change.residual):
+            break
+        theta, start = moved, starts
+        change = change._replace(residual=there - fitted.residual)
+        shift = _step(problem, change, theta, free, keep)
+        if np.linalg.norm(projected(problem, change)[0] @ shift) < UNFELT:
+            break
+    return theta, fitted.residual + change.residual
+
+
+def _cost(problem: Problem, residual: np.ndarray) -> float:
+    return float(np.sum(residual[problem.fitted] ** 2))
+
+
+def _whitened(problem: Problem, simulator, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
+    return problem.whiten(simulator.predict(theta[None], start[None], problem.segments))[0]
 
 
 def _shift_by_fits(problem: Problem, near: Fit) -> np.ndarray:

@@ -54,8 +54,8 @@ def record(time, damping=0.0, delay=0, noise=1e-3, seed=0, command=1.0, finer=1)
     )
 
 
-def make_problem(recordings, candidates, horizon=0.4, model=MODEL) -> Problem:
-    grid = choose_grid(recordings, 0.002)
+def make_problem(recordings, candidates, horizon=0.4, model=MODEL, timestep=0.002) -> Problem:
+    grid = choose_grid(recordings, timestep)
     segments = cut(recordings, grid, horizon)
     fitted = np.ones(len(segments.start), bool)
     coarse, finer = (Simulator(model, candidates, grid, refine) for refine in (1, 2))

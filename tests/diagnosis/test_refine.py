@@ -5,10 +5,18 @@ import dataclasses
 import numpy as np
 import pytest
 
+from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.diagnose import diagnose
-from garat_jax.effects import CATALOGUE
+from garat_jax.diagnosis.findings import Candidate, Interval
+from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.metric import make_metric, noise_floor
+from garat_jax.diagnosis.rank import _select
+from garat_jax.diagnosis.screen import Score
+from garat_jax.diagnosis.steps import Step
+from garat_jax.effects import CATALOGUE, AsymmetricFriction, CoulombFriction
 from tests import models
 from tests.diagnosis.pendulum import MODEL, record
+from tests.diagnosis.test_fit import make_problem
 
 KINDS = ("coulomb_friction", "viscous_damping", "stribeck_friction", "asymmetric_friction")
 STATIC, COULOMB, SPEED = 0.15, 0.08, 0.4
@@ -75,3 +83,32 @@ def test_damping_is_refined_whatever_name_it_was_fitted_under():
 
     found = diagnose(model, [record(lambda spec: None, seed, torque=rub) for seed in range(4)])
     assert [c.effect for c in found.selected] == ["asymmetric_friction"]
+
+
+def test_a_law_found_before_gives_way_to_its_refinement():
+    laws = (CoulombFriction("joint/hinge"), AsymmetricFriction("joint/hinge"))
+    coulomb, positive, negative = 0, 1, 2
+
+    def rub(spec):
+        spec.joint("hinge").frictionloss = 0.08
+
+    def more(speed: float) -> float:
+        return -0.04 * (speed > 0)
+
+    problem = make_problem([record(rub, seed, torque=more) for seed in range(2)], laws)
+    starts = problem.segments.start
+    problem = dataclasses.replace(problem, fitted=np.arange(len(starts)) % 4 > 0)
+    found = fit(problem, problem.simulator.base, starts, (coulomb,))
+    nan = float("nan")
+    score = Score(0, (coulomb,), (0.1,), {}, 0.5, 0.0, True, np.zeros(0))
+    named = Candidate(
+        laws[0].kind, laws[0].target, {}, 0.5, 0.0, nan, Interval(nan, nan, nan), 1.0, (), True, ""
+    )
+    step = Step(named, Contender(score, found), found, [])
+    floor = noise_floor(problem, make_metric(problem), found)
+    selected = _select(problem, found, floor, [step], lambda line: None)
+    assert [step.candidate.effect for step in selected.steps] == ["asymmetric_friction"]
+    assert selected.fit.theta[coulomb] == 0.0
+    assert coulomb not in selected.fit.free
+    assert selected.fit.theta[positive] == pytest.approx(0.12, rel=0.1)
+    assert selected.fit.theta[negative] == pytest.approx(0.08, rel=0.1)

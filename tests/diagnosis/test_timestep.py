@@ -10,7 +10,8 @@ from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.metric import trusted
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.timestep import count_timestep
-from garat_jax.effects import ViscousDamping
+from garat_jax.effects import CoggingTorque, ViscousDamping
+from tests.diagnosis import pendulum
 from tests.diagnosis.test_fit import UNIFORM, make_problem, record
 from tests.diagnosis.test_starts import FRICTION, puck
 
@@ -52,3 +53,21 @@ def test_a_shift_that_does_less_or_more_than_promised_is_not_made(monkeypatch, k
     if not stays:
         shift = abs(counted.theta[0] - found.theta[0])
         assert counted.high[0] - counted.low[0] > 2 * abs(1 - kept) * shift
+
+
+def test_steps_are_repeated_where_one_does_not_undo_the_timestep(monkeypatch):
+    amplitude, periods, phase = 0.3, 16.0, 0.4
+
+    def ripple(angle: float) -> float:
+        return amplitude * np.sin(periods * angle + phase)
+
+    recordings = [pendulum.record(lambda spec: None, seed, ripple=ripple) for seed in range(2)]
+    problem = make_problem(recordings, [CoggingTorque("joint/hinge")], timestep=0.004)
+    begin = np.asarray([amplitude, periods, phase])
+    found = fit(problem, begin, problem.segments.start, (0, 1, 2))
+    counted = count_timestep(problem, found)
+    monkeypatch.setattr(timestep, "SHIFTS", 1)
+    one = count_timestep(problem, found)
+    assert one.low[0] > amplitude
+    assert counted.low[0] < amplitude < counted.high[0]
+    assert abs(counted.theta[0] - amplitude) < 0.2 * abs(one.theta[0] - amplitude)
