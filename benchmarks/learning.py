@@ -7,7 +7,8 @@ library has it. Its seeds run in `--jobs` processes. Both learn in two trust reg
 and that of the peer's user who gives it the paper's number, which it takes for a mean over the
 actions' components and not their sum. Ours also learns in the targets of the pairs, which it should
 solve, for longer where a million steps are not enough. `--extend` keeps the rows of the result file
-and adds what it lacks; each names its commit.
+and adds what they lack, seeds too; each names the commits of its seeds. Where five seeds leave open
+who learns more, `--extend --seeds 10 --envs half_cheetah --regions sum --pairs` takes ten there.
 """
 
 # pyright: reportMissingImports=false
@@ -17,9 +18,9 @@ import importlib.metadata
 import json
 import multiprocessing
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -51,18 +52,24 @@ Kept = dict[tuple[str, str, float], dict[str, Any]]
 """Rows of an earlier run, by where, who and trust region."""
 
 
+Region = Literal["sum", "mean"]
+"""Trust region: its limit is on the sum over the actions' components, or on their mean."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Measure what TRPO learns, beside sb3-contrib's."""
 
     envs: tuple[str, ...] = ("inverted_pendulum", "hopper", "half_cheetah", "walker2d")
     """The environments."""
+    regions: tuple[Region, ...] = ("sum", "mean")
+    """Trust regions in them; with one action they are the same."""
     pairs: tuple[str, ...] = tuple(PAIRS)
     """The pairs whose targets ours learns in."""
     steps: int = 1_000_000
     """Environment steps of each seed."""
     seeds: int = 5
-    """How many seeds."""
+    """How many seeds, at least."""
     jobs: int = 2
     """Processes for the peer's seeds."""
     extend: bool = False
@@ -75,16 +82,17 @@ def host_world(name: str) -> World:
     return make_world(ENVS[name](), engine="mujoco")
 
 
-def configs(world: World) -> list[TRPOConfig]:
-    """Return the paper's trust region, and as wide a one as the peer makes of its numbers."""
+def configs(world: World, regions: Sequence[Region]) -> list[TRPOConfig]:
+    """Return settings with the paper's trust region, and with as wide a one as the peer's mean."""
     paper, num_actions = TRPOConfig(), world.env.action_size
     wide = dataclasses.replace(
         paper, max_kl=num_actions * paper.max_kl, cg_damping=num_actions * paper.cg_damping
     )
-    return [paper, wide] if num_actions > 1 else [paper]
+    by_region: dict[Region, TRPOConfig] = {"sum": paper, "mean": wide}
+    return list(dict.fromkeys(by_region[region] for region in regions))
 
 
-def learn(world: World, config: TRPOConfig, seeds: int, steps: int) -> np.ndarray:
+def learn(world: World, config: TRPOConfig, seeds: Sequence[int], steps: int) -> np.ndarray:
     """Train ours; return mean returns [points, seeds]."""
     agent = trpo.make(world.env, config)
     options = compiler_options(world.params)
@@ -100,7 +108,7 @@ def learn(world: World, config: TRPOConfig, seeds: int, steps: int) -> np.ndarra
     def iterate(state):
         return jax.vmap(agent.step, (0, None))(state, world.params)[0]
 
-    keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
+    keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
     state = jax.jit(jax.vmap(agent.init, (0, None)), compiler_options=options)(keys, world.params)
     step = jax.jit(iterate, compiler_options=options)
     score = jax.jit(jax.vmap(evaluate), compiler_options=options)
@@ -143,9 +151,19 @@ def learn_peer(name: str, config: TRPOConfig, seed: int, steps: int) -> list[flo
 
 
 def row_of(
-    where: str, agent: str, config: TRPOConfig, solved: float, returns: np.ndarray, steps: int
+    where: str,
+    agent: str,
+    config: TRPOConfig,
+    solved: float,
+    returns: np.ndarray,
+    steps: int,
+    earlier: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return a row from mean returns [points, seeds]."""
+    """Return a row from mean returns [points, seeds], behind those of an earlier row."""
+    commits = [(git_state() or {}).get("commit")] * returns.shape[1]
+    if earlier:
+        returns = np.concatenate([earlier["returns"], returns], axis=1)
+        commits = [*commits_of(earlier), *commits]
     row = {
         "env": where,
         "agent": agent,
@@ -156,10 +174,20 @@ def row_of(
         "standard_error": float(returns[-1].std(ddof=1) / np.sqrt(returns.shape[1])),
         "solved_return": solved,
         "solved": [bool(best >= solved) for best in returns.max(axis=0)],
-        "commit": (git_state() or {}).get("commit"),
+        "commits": commits,
     }
     print(row, flush=True)
     return row
+
+
+def commits_of(row: dict[str, Any]) -> list[str | None]:
+    """Return the commit of each seed of a row; one that was not extended may name it once."""
+    return row["commits"] if "commits" in row else [row["commit"]] * len(row["solved"])
+
+
+def lacking(row: dict[str, Any] | None, seeds: int) -> range:
+    """Return the seeds that a row does not have yet."""
+    return range(len(row["solved"]) if row else 0, seeds)
 
 
 def _key(row: dict[str, Any]) -> tuple[str, str, float]:
@@ -175,46 +203,47 @@ def recorded(arguments: Arguments) -> tuple[Kept, Kept]:
     """Return the rows of the result file, of worlds and of targets; not where `TIMES` changed.
 
     Raises:
-        SystemExit: They have another number of seeds or steps.
+        SystemExit: They have another number of steps.
     """
     path = arguments.out / f"{NAME}.json"
-    result, seeds = json.loads(path.read_text(encoding="utf-8")), arguments.seeds
-    worlds, sizes = result["rows"], {_size(row) for row in result["rows"]}
-    if sizes - {(seeds, arguments.steps)}:
-        raise SystemExit(f"--extend: {path} has (seeds, steps) {sorted(sizes)}; give the same")
+    result = json.loads(path.read_text(encoding="utf-8"))
+    worlds, sizes = result["rows"], {row["steps"][-1] for row in result["rows"]}
+    if sizes - {arguments.steps}:
+        raise SystemExit(f"--extend: {path} has {sorted(sizes)} steps; give the same")
     targets = [
-        row
-        for row in result["targets"]
-        if _size(row) == (seeds, target_steps(arguments, row["env"]))
+        row for row in result["targets"] if row["steps"][-1] == target_steps(arguments, row["env"])
     ]
     return {_key(row): row for row in worlds}, {_key(row): row for row in targets}
 
 
-def _size(row: dict[str, Any]) -> tuple[int, int]:
-    return len(row["solved"]), row["steps"][-1]
-
-
 def measure(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]]:
     """Yield a row for each world, agent and trust region."""
-    seeds, steps = arguments.seeds, arguments.steps
+    steps = arguments.steps
     worlds = {name: host_world(name) for name in arguments.envs}
-    sides = [(name, world, config) for name, world in worlds.items() for config in configs(world)]
+    sides = [
+        (name, world, config)
+        for name, world in worlds.items()
+        for config in configs(world, arguments.regions)
+    ]
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(arguments.jobs, mp_context=context) as pool:
         peers = {
-            (name, config): [pool.submit(learn_peer, name, config, k, steps) for k in range(seeds)]
+            (name, config): [
+                pool.submit(learn_peer, name, config, seed, steps)
+                for seed in lacking(kept.get((name, PEER, config.max_kl)), arguments.seeds)
+            ]
             for name, _, config in sides
-            if not kept.get((name, PEER, config.max_kl))
         }
         for name, world, config in sides:
             solved = world.env.task.solved_return
-            ours = kept.get((name, OURS, config.max_kl)) or row_of(
-                name, OURS, config, solved, learn(world, config, seeds, steps), steps
-            )
-            theirs = kept.get((name, PEER, config.max_kl))
-            if theirs is None:
-                returns = np.asarray([future.result() for future in peers[name, config]]).T
-                theirs = row_of(name, PEER, config, solved, returns, steps)
+            ours, theirs = (kept.get((name, agent, config.max_kl)) for agent in (OURS, PEER))
+            if seeds := lacking(ours, arguments.seeds):
+                returns = learn(world, config, seeds, steps)
+                ours = row_of(name, OURS, config, solved, returns, steps, ours)
+            if futures := peers[name, config]:
+                returns = np.asarray([future.result() for future in futures]).T
+                theirs = row_of(name, PEER, config, solved, returns, steps, theirs)
+            assert ours and theirs
             least = theirs["mean"] - WITHIN * abs(theirs["mean"])
             yield theirs
             yield ours | {"met": ours["mean"] >= least}
@@ -226,13 +255,17 @@ def measure_targets(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]
     for name in arguments.pairs:
         _, target = PAIRS[name].worlds("mujoco")
         solved, steps = target.env.task.solved_return, target_steps(arguments, name)
-        yield kept.get((name, OURS, config.max_kl)) or row_of(
-            name, OURS, config, solved, learn(target, config, arguments.seeds, steps), steps
-        )
+        row = kept.get((name, OURS, config.max_kl))
+        if seeds := lacking(row, arguments.seeds):
+            returns = learn(target, config, seeds, steps)
+            row = row_of(name, OURS, config, solved, returns, steps, row)
+        assert row
+        yield row
 
 
 def write(arguments: Arguments, rows: Kept, targets: Kept) -> Path:
     """Write all rows so far."""
+    seeds = max(len(row["solved"]) for row in (*rows.values(), *targets.values()))
     details = {
         "peer": {k: importlib.metadata.version(k) for k in ("sb3-contrib", "torch")},
         "within": WITHIN,
@@ -242,7 +275,7 @@ def write(arguments: Arguments, rows: Kept, targets: Kept) -> Path:
     return write_result(
         NAME,
         [*rows.values()],
-        seeds=range(arguments.seeds),
+        seeds=range(seeds),
         command=command_line(),
         details=details,
         folder=arguments.out,
@@ -257,7 +290,6 @@ def main() -> None:
         (measure_targets(arguments, targets), targets),
     ):
         for row in measured:
-            into.pop(_key(row), None)  # rows stand in the order of measuring
             into[_key(row)] = row
             path = write(arguments, rows, targets)  # so that --extend can go on from here
             print(path, flush=True)

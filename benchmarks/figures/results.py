@@ -34,8 +34,9 @@ def origin(name: str, result: dict[str, Any]) -> str:
 
 
 def commits(rows: Sequence[dict[str, Any]]) -> str:
-    """Say of which commits rows are, where they are of several."""
-    found = sorted({row["commit"][:7] for row in rows})
+    """Say of which commits rows, or parts of a row, are, where they are of several."""
+    every = [commit for row in rows for commit in row.get("commits", [row.get("commit")])]
+    found = sorted({commit[:7] for commit in every if commit})
     return f"\nThe rows are of the commits {', '.join(found)}.\n" if len(found) > 1 else ""
 
 

@@ -116,9 +116,12 @@ def learning() -> str:
 
 def _learning(result: dict[str, Any]) -> str:
     """One row a world, trust region and agent: mean returns at each point of the training."""
+    fewest = min(len(row["solved"]) for row in result["rows"])
+    more = {n: f", {n} seeds" for row in result["rows"] if (n := len(row["solved"])) > fewest}
     lines = [
         (
-            f"{WORLDS[row['env']]}, KL ≤ {row['max_kl']:g}, {row['agent']}",
+            f"{WORLDS[row['env']]}, KL ≤ {row['max_kl']:g}, {row['agent']}"
+            + more.get(len(row["solved"]), ""),
             *(f"{sum(returns) / len(returns):,.0f}" for returns in row["returns"][:-1]),
             f"**{row['mean']:,.0f} ± {row['standard_error']:,.0f}**",
         )

@@ -24,8 +24,8 @@ SAME = 1.0 - 1e-9
 FIRM = 2.0
 """Half-widths of its 95 % interval by which a parameter that screening left out must differ from no
 effect, at a timestep of 0, to be fitted in the end."""
-SHOWN = 0.01
-"""Largest corrected p-value of what a refinement changes beside the law that it refines."""
+LIKELY = 0.02
+"""Share of the residual that a candidate must be expected to explain to be fitted."""
 HOPELESS = 8.0
 """What a candidate is expected to leave unexplained, relative to what the best one left when it was
 fitted, above which it is not fitted; the runner-up always is."""
@@ -62,9 +62,9 @@ def fit_contenders(
         scores: What screening says, best first.
         say: Told what is being done.
     """
-    contenders = _fit_instead(problem, current, refinable, scores, say)
+    contenders = _fit_refined(problem, current, refinable, scores, say)
     done = {c.score.effect for c in contenders}
-    likely = [s for s in scores if not s.excluded and s.possible and s.share > 0.02]
+    likely = [s for s in scores if not s.excluded and s.possible and s.share > LIKELY]
     likely = [s for s in likely if s.effect not in done]
     likely = [s for s in likely if s.share > 0.25 * likely[0].share]
     likely = [s for s in likely if not simpler_law(problem, s, likely)]
@@ -101,20 +101,19 @@ def fit_refinements(
         say: Told what is being done.
         hidden_only: Leave out the laws that screening sees, because they have no threshold.
     """
-    simulator, simple = problem.simulator, best.score.effect
-    none = simulator.effects[simple].at(simulator.host, simulator.effects[simple].target)
-    own = columns_of(simulator.slots, simple)
-    if any(current.theta[j] != none[name] for name, j in own.items()):
+    simple = best.score.effect
+    if _acts(problem, simple, current.theta):
         return []
     rival = best.fit.cost[problem.fitted].sum()
     return [
-        _fit(problem, current, score, rival, say)
-        for score in _refining(problem, best.fit.theta, simple, scores)
-        if not hidden_only or problem.num_listed(score.effect) > 1
+        _fit(problem, current, refined, rival, say)
+        for score in scores
+        if (refined := _refined(problem, score, best.fit.theta, [simple]))
+        and (not hidden_only or problem.num_listed(score.effect) > 1)
     ]
 
 
-def _fit_instead(
+def _fit_refined(
     problem: Problem,
     current: Fit,
     held: Sequence[int],
@@ -124,7 +123,8 @@ def _fit_instead(
     """Fit the laws that refine those of effects selected before, each in the place of the simpler.
 
     Beside what was found since, or over longer segments, the difference may show. Those are fitted
-    of which screening says that they change something that the simpler law leaves, whatever sign.
+    that screening expects to explain something that the simpler law leaves, whatever the sign. A
+    law that acted before anything was selected is left as it is.
 
     Args:
         problem: The recordings and the model with every candidate.
@@ -133,32 +133,53 @@ def _fit_instead(
         scores: What screening says.
         say: Told what is being done.
     """
-    found = []
-    for simple in held:
-        own = list(columns_of(problem.simulator.slots, simple).values())
-        theta = current.theta.copy()
-        theta[own] = problem.simulator.base[own]
-        free = tuple(j for j in current.free if j not in own)
-        rest = dataclasses.replace(current, theta=theta, free=free)
-        for score in _refining(problem, current.theta, simple, scores):
-            if score.p_value < SHOWN and not score.excluded:
-                found.append(_fit(problem, rest, score, np.inf, say))
-    return found
-
-
-def _refining(problem: Problem, theta: np.ndarray, simple: int, scores: Sequence[Score]):
-    """Return the scores of laws that refine another at its place, to begin as it was fitted."""
     simulator, found = problem.simulator, []
-    (law,) = simulator.with_parameters([float(value) for value in theta], [simple])
+    added = [effect for effect in held if not _acts(problem, effect, simulator.base)]
     for score in scores:
-        finer = simulator.effects[score.effect]
-        if finer.target != law.target or law.kind not in finer.refines:
+        if score.excluded or score.share < LIKELY:
             continue
-        if alike := type(finer).refined_from(law):
-            columns = columns_of(simulator.slots, score.effect)
-            start = {columns[name]: value for name, value in alike.items()}
-            found.append(dataclasses.replace(score, columns=tuple(start), start=start))
+        simpler = [i for i in added if _refines(problem, score.effect, i)]
+        if refined := _refined(problem, score, current.theta, simpler):
+            own = [j for i in simpler for j in columns_of(simulator.slots, i).values()]
+            theta = current.theta.copy()
+            theta[own] = simulator.base[own]
+            free = tuple(j for j in current.free if j not in own)
+            without = dataclasses.replace(current, theta=theta, free=free)
+            found.append(_fit(problem, without, refined, np.inf, say))
     return found
+
+
+def _acts(problem: Problem, effect: int, theta: np.ndarray) -> bool:
+    """Say whether an effect acts under some parameters, [num_parameters]."""
+    simulator, law = problem.simulator, problem.simulator.effects[effect]
+    none = law.at(simulator.host, law.target)
+    columns = columns_of(simulator.slots, effect)
+    return any(theta[j] != none[name] for name, j in columns.items())
+
+
+def _refines(problem: Problem, finer: int, simpler: int) -> bool:
+    """Say whether one effect's law refines another's at its place."""
+    one, other = (problem.simulator.effects[i] for i in (finer, simpler))
+    return one.target == other.target and other.kind in one.refines
+
+
+def _refined(problem: Problem, score: Score, theta: np.ndarray, simpler: Sequence[int]):
+    """Return the score of a law that begins as simpler ones were fitted; None if it refines none.
+
+    Args:
+        problem: What is fitted.
+        score: What screening says of the law.
+        theta: The parameters of the simpler ones, among all, [num_parameters].
+        simpler: Indices of these effects.
+    """
+    simulator = problem.simulator
+    columns = columns_of(simulator.slots, score.effect)
+    refining = [i for i in simpler if _refines(problem, score.effect, i)]
+    start: dict[int, float] = {}
+    for law in simulator.with_parameters([float(value) for value in theta], refining):
+        alike = type(simulator.effects[score.effect]).refined_from(law)
+        start |= {columns[name]: value for name, value in alike.items()}
+    return dataclasses.replace(score, columns=tuple(start), start=start) if start else None
 
 
 def fit_further(problem: Problem, best: Contender, say: Callable[[str], None]) -> list[Contender]:
@@ -264,10 +285,15 @@ def _as_twin(problem: Problem, current: Fit, twin: Contender, like: Score, score
     if np.any(problem.within_bounds(columns, values) != values):
         return None
     fitted = renamed(twin.fit, twin.score.columns, columns, without=current.theta)
-    predicted = problem.simulator.predict(fitted.theta[None], fitted.start[None], problem.segments)
-    if not np.allclose(problem.whiten(predicted)[0], fitted.residual, atol=1e-6):
+    if not is_predicted(problem, fitted):
         return None
     return Contender(dataclasses.replace(score, columns=columns), fitted)
+
+
+def is_predicted(problem: Problem, fitted: Fit) -> bool:
+    """Say whether a fit that was renamed still predicts what is left of its residual."""
+    predicted = problem.simulator.predict(fitted.theta[None], fitted.start[None], problem.segments)
+    return np.allclose(problem.whiten(predicted)[0], fitted.residual, atol=1e-6)
 
 
 def stands_for(problem: Problem, one: Score, other: Score) -> dict[int, int]:

@@ -56,7 +56,7 @@ def judge(
     if contenders:
         costs = _block_costs(problem, 1.0, [c.fit for c in contenders], slice(None))
         num_blocks = costs.shape[1]
-        penalty = [len(c.score.columns) * np.log(num_blocks) / num_blocks for c in contenders]
+        penalty = [len(c.fit.free) * np.log(num_blocks) / num_blocks for c in contenders]
         criterion = np.log(costs.sum(axis=1)) + penalty
         drawn = np.log(_resamples(num_blocks) @ costs.T) + penalty
         at_floor = [not is_above(problem, metric, c.fit, floor, AT_FLOOR) for c in contenders]
@@ -67,7 +67,7 @@ def judge(
         }
         near = [i for i in (order[0], *alike[order[0]]) if at_floor[order[0]] and at_floor[i]]
         passing = [i for i in near if found[i][0].passes]
-        best = min(passing, key=lambda i: len(contenders[i].score.columns), default=order[0])
+        best = min(passing, key=lambda i: len(contenders[i].fit.free), default=order[0])
         judged = [found[best], *(found[i] for i in order if i != best)]
         judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
     fitted = [c.score.effect for c in contenders]

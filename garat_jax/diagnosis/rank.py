@@ -17,6 +17,7 @@ from garat_jax.diagnosis.contend import (
     fit_contenders,
     fit_further,
     fit_refinements,
+    is_predicted,
     renamed,
     stands_for,
     with_evidence,
@@ -215,7 +216,8 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         if not chosen:
             break
         free = {*chosen[-1].fit.free}  # of a law that was refined, nothing is free any more
-        steps = [*(s for s in steps if free & {*s.contender.score.columns}), *chosen]
+        stay = [step for step in steps if free & {*step.contender.score.columns}]
+        is_refined, steps = len(stay) < len(steps), [*stay, *chosen]
         added = _completed(problem, [step.contender for step in steps], say)
         current = added.fit
         steps[-1] = steps[-1]._replace(fit=current)
@@ -224,6 +226,8 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         if is_above(problem, metric, current, floor, AT_FLOOR):
             steps, current = swap(problem, steps, current, say)
             floor = noise_floor(problem, metric, current)
+        if is_refined:
+            steps = refitted(problem, steps, current)
         timeless = added.timeless if current is added.fit else None
     return Selection(problem, steps, current, timeless, floor, first_round, best)
 
@@ -352,8 +356,6 @@ def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
     alike = {other for c in selected for other in c.indistinguishable_from}
     corrected = []
     for candidate in candidates:
-        if candidate.named in kept and not candidate.passes:
-            candidate = selected[kept[candidate.named]]
         if candidate.passes and candidate.named not in {*kept, *alike}:
             why = f"superfluous with {' and '.join(map(str, kept))}"
             candidate = dataclasses.replace(candidate, passes=False, why=why)
@@ -363,17 +365,15 @@ def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
 
 
 def _as_shown(problem: Problem, steps: Sequence[Step], final: Fit) -> dict[Named, Candidate]:
-    """Return the selected effects, and their other names, with what the final fit says of them."""
-    metric, shown = make_metric(problem), {}
+    """Return the selected effects, and their other names, with their sizes from the final fit."""
+    shown = {}
     for step in steps:
-        error = metric.error(step.fit.residual, ~problem.fitted)
         for candidate, contender in [(step.candidate, step.contender), *step.alike]:
             if contender.fit.residual is not step.contender.fit.residual:
                 continue
             names = stands_for(problem, step.contender.score, contender.score)
             fit = renamed(final, [*names], [*names.values()], without=problem.simulator.base)
-            found = estimates(problem, contender.score.effect, fit)
-            shown[candidate.named] = dataclasses.replace(
-                candidate, parameters=found, error_after=error
-            )
+            if contender is step.contender or is_predicted(problem, fit):
+                sizes = estimates(problem, contender.score.effect, fit)
+                shown[candidate.named] = dataclasses.replace(candidate, parameters=sizes)
     return shown

@@ -19,8 +19,8 @@ UNFELT = 0.1
 """Norm of what a shift is to change, in standard deviations of noise, below which it is none."""
 SHIFTS = 4
 """Largest number of Gauss-Newton steps to a timestep of 0."""
-EXPLAINS_LESS = 1.1
-"""What would be left at a timestep of 0, relative to what the fit leaves, above which it cannot be
+EXPLAINED = 1.1
+"""What would be left at a timestep of 0, relative to what the fit leaves, up to which that can be
 extrapolated."""
 REFITTED = 24
 """Segments that are fitted again at least, at both timesteps."""
@@ -33,8 +33,7 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     many times the noise. Where halving the timestep does much less or more than sensitivities
     promise, or a timestep of 0 would explain less than the fit does, as across contacts, estimates
     stay, fits at both timesteps say how far they are from those at 0, and their intervals reach as
-    far. Where contacts make the cost rough, that of a
-    smooth surface counts; see `smooth_minimum`.
+    far. Where contacts make the cost rough, that of a smooth surface counts; see `smooth_minimum`.
     """
     keep = np.asarray([j not in fitted.frozen for j in fitted.free], bool)
     if not np.any(keep):
@@ -57,13 +56,13 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     near = lin._replace(start=fitted.sensitivity)
     shift = _step(problem, near._replace(residual=2.0 * halved), theta, free, keep)
     kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
-    moved, left = _step_on(problem, near._replace(residual=2.0 * halved), fitted, shift, keep)
-    explains_less = _cost(problem, left) > EXPLAINS_LESS * _cost(problem, fitted.residual)
-    if abs(1.0 - kept) > 1.0 - KEPT_PROMISE or explains_less:
+    there = _step_on(problem, near._replace(residual=2.0 * halved), fitted, shift, keep)
+    if abs(1.0 - kept) > 1.0 - KEPT_PROMISE or there is None:
         low, high = _wider(interval(problem, theta, lin, free, keep), rough)
         shift = _shift_by_fits(problem, fitted)
         low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
         return dataclasses.replace(fitted, low=low, high=high)
+    moved, left = there
     low, high = _wider(interval(problem, moved, lin._replace(residual=left), free, keep), rough)
     unsure = max(EXTRAPOLATED, abs(1.0 - kept)) * np.abs((moved - theta)[list(free)])
     return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
@@ -93,25 +92,31 @@ def _step_on(problem: Problem, change: Linearisation, fitted: Fit, shift: np.nda
         keep: Which of them are excited, [k] bool.
 
     Returns:
-        The parameters there, [num_parameters], and the residual as it would be, [S, N].
+        The parameters there, [num_parameters], and the residual as it would be, [S, N]; None where
+        not even the first step lowers what is left, or more stays than the fit leaves.
     """
     free, unit = list(fitted.free), problem.segments.start_unit
     theta, start, undamped = fitted.theta, fitted.start, np.zeros(len(fitted.start))
     for _ in range(SHIFTS):
+        sensitivity, before = projected(problem, change)
+        if np.linalg.norm(sensitivity @ shift) < UNFELT:
+            break
         moved = theta.copy()
         moved[free] += shift
         expected = change.residual + change.parameters @ shift
         starts = start + start_step(problem, change, expected, undamped, 0.0) * unit
         there = 2.0 * _whitened(problem, problem.finer, moved, starts)
         there -= _whitened(problem, problem.simulator, moved, starts)
-        if _cost(problem, there) >= _cost(problem, fitted.residual + change.residual):
+        there = change._replace(residual=there - fitted.residual)
+        if np.linalg.norm(projected(problem, there)[1]) >= np.linalg.norm(before):
+            if theta is fitted.theta:
+                return None
             break
-        theta, start = moved, starts
-        change = change._replace(residual=there - fitted.residual)
+        theta, start, change = moved, starts, there
         shift = _step(problem, change, theta, free, keep)
-        if np.linalg.norm(projected(problem, change)[0] @ shift) < UNFELT:
-            break
-    return theta, fitted.residual + change.residual
+    left = fitted.residual + change.residual
+    explains_less = _cost(problem, left) > EXPLAINED * _cost(problem, fitted.residual)
+    return None if theta is not fitted.theta and explains_less else (theta, left)
 
 
 def _cost(problem: Problem, residual: np.ndarray) -> float:

@@ -55,6 +55,21 @@ def test_a_shift_that_does_less_or_more_than_promised_is_not_made(monkeypatch, k
         assert counted.high[0] - counted.low[0] > 2 * abs(1 - kept) * shift
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("EXPLAINED", 0.0), ("_whitened", lambda *_: 1e3), ("UNFELT", np.inf)]
+)
+def test_a_shift_that_explains_no_more_is_not_made(monkeypatch, name, value):
+    recordings = [record(UNIFORM, damping=0.02, noise=1e-5, finer=32)]
+    problem = make_problem(recordings, [ViscousDamping("joint/hinge")])
+    found = fit(problem, problem.simulator.base, problem.segments.start, (0,))
+    assert count_timestep(problem, found).theta[0] != found.theta[0]
+    monkeypatch.setattr(timestep, name, value)
+    counted = count_timestep(problem, found)
+    assert counted.theta[0] == found.theta[0]
+    if name != "UNFELT":
+        assert counted.low[0] < 0.02 < counted.high[0]
+
+
 def test_steps_are_repeated_where_one_does_not_undo_the_timestep(monkeypatch):
     amplitude, periods, phase = 0.3, 16.0, 0.4
 
