@@ -1,4 +1,4 @@
-"""The devices that JAX computes on, and how much memory this process has used."""
+"""The devices that JAX computes on, the cores, and how much memory this process has used."""
 
 import os
 import resource
@@ -11,6 +11,17 @@ from garat_jax.errors import UserError
 
 NOT_THERE = "Unable to initialize backend"
 """How JAX begins to say that there is no such device."""
+
+
+def num_cores() -> int:
+    """Return how many of the machine's cores this process may use.
+
+    One thread for each is enough: where there are more threads than cores, they wait for each
+    other, and a step of eight small simulations takes ten times as long.
+    """
+    if hasattr(os, "sched_getaffinity"):  # not everywhere
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def use(device: str) -> list[Any]:

@@ -20,7 +20,7 @@ from garat_jax.compiler_options import (
     compiler_options,
     options_for,
 )
-from garat_jax.devices import use
+from garat_jax.devices import num_cores, use
 from garat_jax.dynamics import Dynamics, PhysicsState
 from garat_jax.overrides import load_spec
 
@@ -169,7 +169,7 @@ def advise(rates: list[Rate], platform: str) -> list[str]:
         f"{BATCH} simulations at once do {gain:.0f} times the steps of one: "
         "run seeds together (--seeds) and give a fit several recordings."
     )
-    cores = os.cpu_count() or 1
+    cores = num_cores()
     if platform == "cpu" and cores > 1 and HOST_DEVICES not in os.environ.get("XLA_FLAGS", ""):
         advice.append(
             "C MuJoCo steps on all cores by itself; for --engine mjx try "

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from garat_jax import host_call
+from garat_jax import devices, host_call
 from garat_jax.errors import UserError
 from garat_jax.setconst import CONSTANT_INPUTS
 
@@ -215,7 +215,7 @@ class _Simulations:
     """
 
     def __init__(self, model: mujoco.MjModel, num: int, fields: tuple[str, ...]):
-        self.batch = Batch(model, num)
+        self.batch = Batch(model, num, nthread=devices.num_cores())
         size = 1 + model.nq + model.nv + model.na + model.nv
         self.state = self.batch.state[:, :size]
         self.inputs = self.batch.state[:, size : size + model.nu + model.nv]

@@ -52,7 +52,7 @@ def test_it_measures_programs_as_they_are_compiled_elsewhere(monkeypatch):
 
 
 def test_it_advises_host_devices_for_mjx_where_there_are_cores(monkeypatch):
-    monkeypatch.setattr(doctor.os, "cpu_count", lambda: 6)
+    monkeypatch.setattr(doctor, "num_cores", lambda: 6)
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     flag = "--xla_force_host_platform_device_count"
     assert any(f"XLA_FLAGS={flag}=6" in x for x in doctor.advise(rates(2.0, 1.0), "cpu"))

@@ -2,6 +2,7 @@
 
 import functools
 import logging
+import os
 import subprocess
 import sys
 
@@ -21,6 +22,7 @@ from garat_jax.effects import (
     RotorInertia,
     ViscousDamping,
 )
+from garat_jax.engine import _Simulations
 from garat_jax.errors import UserError
 from garat_jax.setconst import set_const
 from tests.models import ARM, MUSCLE, PENDULUM, TUMBLER, showing, spec
@@ -337,6 +339,13 @@ def test_ctrl_c_while_mujoco_warns_does_not_abort_the_process():
     program = [sys.executable, "-c", INTERRUPTED]
     done = subprocess.run(program, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "stopped\n"), done.stderr[-1000:]
+
+
+def test_mujoco_has_a_thread_for_each_core_that_the_process_may_use(monkeypatch):
+    model = spec(PENDULUM).compile()
+    for cores in ({3}, {1, 3}):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _, cores=cores: cores, raising=False)
+        assert _Simulations(model, 8, ()).batch.nthread == len(cores)
 
 
 def test_the_native_model_is_what_the_engine_steps():

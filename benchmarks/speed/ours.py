@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from garat_jax import rollout
+from garat_jax import devices, rollout
 from garat_jax.agents import ppo, trpo
 from garat_jax.agents.ppo import PPOConfig
 from garat_jax.agents.trpo import TRPOConfig
@@ -109,7 +109,7 @@ def engine_alone(env_name: str, world: World, size: Size) -> Side:
     """
     host = world.params.host.model
     states, controls = _random_states(world, size)
-    batch = Batch(host, states.shape[1])
+    batch = Batch(host, states.shape[1], nthread=devices.num_cores())
     views = [batch.bind(name) for name in ("qpos", "qvel", "ctrl")]
     split = np.split(states, [host.nq], axis=2)
     inputs = [(*(part[t] for part in split), controls[t]) for t in range(len(states))]

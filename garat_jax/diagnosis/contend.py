@@ -108,7 +108,8 @@ def fit_refinements(
     return [
         _fit(problem, current, refined, rival, say)
         for score in scores
-        if (refined := _refined(problem, score, best.fit.theta, [simple]))
+        if _refines(problem, score.effect, simple)
+        and (refined := _refined(problem, score, best.fit.theta, [simple]))
         and (not hidden_only or problem.num_listed(score.effect) > 1)
     ]
 
@@ -164,19 +165,18 @@ def _refines(problem: Problem, finer: int, simpler: int) -> bool:
 
 
 def _refined(problem: Problem, score: Score, theta: np.ndarray, simpler: Sequence[int]):
-    """Return the score of a law that begins as simpler ones were fitted; None if it refines none.
+    """Return the score of a law that begins as simpler ones were fitted; None if it cannot.
 
     Args:
         problem: What is fitted.
         score: What screening says of the law.
         theta: The parameters of the simpler ones, among all, [num_parameters].
-        simpler: Indices of these effects.
+        simpler: Indices of these effects, whose laws it refines; there may be none.
     """
     simulator = problem.simulator
     columns = columns_of(simulator.slots, score.effect)
-    refining = [i for i in simpler if _refines(problem, score.effect, i)]
     start: dict[int, float] = {}
-    for law in simulator.with_parameters([float(value) for value in theta], refining):
+    for law in simulator.with_parameters([float(value) for value in theta], simpler):
         alike = type(simulator.effects[score.effect]).refined_from(law)
         start |= {columns[name]: value for name, value in alike.items()}
     return dataclasses.replace(score, columns=tuple(start), start=start) if start else None
@@ -292,8 +292,8 @@ def _as_twin(problem: Problem, current: Fit, twin: Contender, like: Score, score
 
 def is_predicted(problem: Problem, fitted: Fit) -> bool:
     """Say whether a fit that was renamed still predicts what is left of its residual."""
-    predicted = problem.simulator.predict(fitted.theta[None], fitted.start[None], problem.segments)
-    return np.allclose(problem.whiten(predicted)[0], fitted.residual, atol=1e-6)
+    predicted = problem.residual_by(problem.simulator, fitted.theta, fitted.start)
+    return np.allclose(predicted, fitted.residual, atol=1e-6)
 
 
 def stands_for(problem: Problem, one: Score, other: Score) -> dict[int, int]:

@@ -140,6 +140,12 @@ class Problem(Generic[AnySimulator]):
         change = np.where(np.isfinite(change), change, 0.0)
         return np.clip(change, -LARGE, LARGE).reshape(*change.shape[:-2], -1)
 
+    def residual_by(
+        self, simulator: AnySimulator, theta: np.ndarray, start: np.ndarray
+    ) -> np.ndarray:
+        """Return the whitened residuals [S, N] of a simulator at one point."""
+        return self.whiten(simulator.predict(theta[None], start[None], self.segments))[0]
+
     @property
     def scale(self) -> np.ndarray:
         """Return what a deviation counts, [S, L, num_signals]."""
@@ -158,8 +164,7 @@ class Problem(Generic[AnySimulator]):
 
         A first-order integrator's error is twice this change.
         """
-        fine = self.finer.predict(theta[None], start[None], self.segments)
-        return self.whiten(fine)[0] - residual
+        return self.residual_by(self.finer, theta, start) - residual
 
     def blocks(self) -> np.ndarray:
         """Return each whitened residual's block within its segment, [N]."""

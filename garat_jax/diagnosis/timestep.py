@@ -56,8 +56,10 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     near = lin._replace(start=fitted.sensitivity)
     shift = _step(problem, near._replace(residual=2.0 * halved), theta, free, keep)
     kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
-    there = _step_on(problem, near._replace(residual=2.0 * halved), fitted, shift, keep)
-    if abs(1.0 - kept) > 1.0 - KEPT_PROMISE or there is None:
+    there = None
+    if abs(1.0 - kept) <= 1.0 - KEPT_PROMISE:
+        there = _step_on(problem, near._replace(residual=2.0 * halved), fitted, shift, keep)
+    if there is None:
         low, high = _wider(interval(problem, theta, lin, free, keep), rough)
         shift = _shift_by_fits(problem, fitted)
         low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
@@ -105,8 +107,8 @@ def _step_on(problem: Problem, change: Linearisation, fitted: Fit, shift: np.nda
         moved[free] += shift
         expected = change.residual + change.parameters @ shift
         starts = start + start_step(problem, change, expected, undamped, 0.0) * unit
-        there = 2.0 * _whitened(problem, problem.finer, moved, starts)
-        there -= _whitened(problem, problem.simulator, moved, starts)
+        there = 2.0 * problem.residual_by(problem.finer, moved, starts)
+        there -= problem.residual_by(problem.simulator, moved, starts)
         there = change._replace(residual=there - fitted.residual)
         if np.linalg.norm(projected(problem, there)[1]) >= np.linalg.norm(before):
             if theta is fitted.theta:
@@ -121,10 +123,6 @@ def _step_on(problem: Problem, change: Linearisation, fitted: Fit, shift: np.nda
 
 def _cost(problem: Problem, residual: np.ndarray) -> float:
     return float(np.sum(residual[problem.fitted] ** 2))
-
-
-def _whitened(problem: Problem, simulator, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
-    return problem.whiten(simulator.predict(theta[None], start[None], problem.segments))[0]
 
 
 def _shift_by_fits(problem: Problem, near: Fit) -> np.ndarray:

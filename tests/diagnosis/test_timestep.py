@@ -56,7 +56,7 @@ def test_a_shift_that_does_less_or_more_than_promised_is_not_made(monkeypatch, k
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("EXPLAINED", 0.0), ("_whitened", lambda *_: 1e3), ("UNFELT", np.inf)]
+    ("name", "value"), [("EXPLAINED", 0.0), ("start_step", lambda *_: 1e3), ("UNFELT", np.inf)]
 )
 def test_a_shift_that_explains_no_more_is_not_made(monkeypatch, name, value):
     recordings = [record(UNIFORM, damping=0.02, noise=1e-5, finer=32)]
