@@ -46,7 +46,8 @@ class Demo:
     seed: int = 0
     """Seed of everything random, the hidden effect among it."""
     measurements: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Recordings of a free pendulum to diagnose as well."""
+    """Folder that holds SinglePendulumDataForParameterEstimation.mat, recordings of a real pendulum
+    (dynamicslab/MultiArm-Pendulum) to diagnose as well."""
     force: bool = False
     """Replace an earlier run in DIR."""
     resume: bool = False

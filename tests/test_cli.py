@@ -83,6 +83,11 @@ def test_version():
         (["diagnose", __file__, "no.csv"], ["DATA", "there is no file no.csv"]),
         (["diagnose", __file__, __file__, "--holdout", "no.csv"], ["--holdout", "no file no.csv"]),
         (["diagnose", __file__, __file__, "--holdout", __file__], ["test_cli.py is given twice"]),
+        (
+            ["diagnose", __file__, __file__, "--condition", f"loaded={__file__}"],
+            ["test_cli.py is given twice"],
+        ),
+        (["demo", "--seed", "-1", "--out", "never"], ["--seed -1: expected 0 or more"]),
         (["demo", "--measurements", "nowhere"], ["--measurements", "no folder nowhere"]),
     ],
 )

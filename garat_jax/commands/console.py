@@ -55,9 +55,14 @@ def make_run(
         out: The folder.
         seeds: The seeds of the run.
         resume: Go on with the run that the folder holds; None if the command cannot.
+
+    Raises:
+        UserError: A seed is negative, or the folder may not be written.
     """
     from garat_jax.runs import RunDirectory, earlier_run_kept
 
+    if min(seeds, default=0) < 0:
+        raise UserError(f"--seed {min(seeds)}: expected 0 or more")
     config = {
         field.name: getattr(command, field.name)
         for field in dataclasses.fields(command)
@@ -81,11 +86,11 @@ def make_run(
 
 def _check_outside(command: Any, out: Path) -> None:
     """Refuse input that lies in the folder that --force is about to replace."""
-    for field in dataclasses.fields(command):
-        given = getattr(command, field.name)
-        for path in given if isinstance(given, tuple) else (given,):
-            inside = isinstance(path, Path) and path.resolve().is_relative_to(out.resolve())
-            if inside and field.name != "out":
+    given = {f.name: getattr(command, f.name) for f in dataclasses.fields(command)}
+    given |= {"out": None, "recordings": tuple(getattr(command, "recordings", tuple)())}
+    for values in given.values():
+        for path in values if isinstance(values, tuple) else (values,):
+            if isinstance(path, Path) and path.resolve().is_relative_to(out.resolve()):
                 raise UserError(f"{path} is in {out}, which --force replaces; give another --out")
 
 

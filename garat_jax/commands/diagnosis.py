@@ -1,6 +1,7 @@
 """Commands that hold a model against recordings: compare, diagnose, improve, ground, plan."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -56,17 +57,24 @@ class WithHoldout(OnRecordings):
         super().check()
         check_files(self.holdout or self.data, "--holdout")
         seen = set[Path]()
-        for path in (*self.data, *self.holdout):
+        for path in self.recordings():
             if path.resolve() in seen:
                 raise UserError(
                     f"{path} is given twice; a recording is either fitted or held out, once"
                 )
             seen.add(path.resolve())
 
+    def recordings(self) -> list[Path]:
+        """List all recordings."""
+        return [*self.data, *self.holdout]
+
 
 @dataclasses.dataclass(frozen=True)
 class Compare(OnRecordings):
-    """Measure the error of a model as it is, by signal and horizon."""
+    """Measure the error of a model as it is, by signal and horizon.
+
+    It writes DIR/compare.json and DIR/report.html.
+    """
 
     also: Annotated[tuple[Path, ...], arg(metavar="MODEL...")] = ()
     """Other models to score in the same table, a repaired model card for example."""
@@ -98,13 +106,22 @@ class WithConditions(WithHoldout):
     """The same, with recordings that were made under other conditions."""
 
     condition: Annotated[tuple[str, ...], arg(metavar="NAME=FILE...")] = ()
-    """Recordings under other conditions, such as with a payload: what DATA shows is shared by all,
-    what these show besides is theirs, and so is a model card, DIR/model-NAME.toml."""
+    """Recordings under other conditions, such as with a payload. What DATA shows is shared by all;
+    what these show besides belongs to NAME. Each NAME gets its own model card,
+    DIR/model-NAME.toml."""
+
+    def recordings(self) -> list[Path]:
+        """List all recordings, those of the other conditions last."""
+        others = parse_conditions(self.condition).values()
+        return [*super().recordings(), *itertools.chain(*others)]
 
 
 @dataclasses.dataclass(frozen=True)
 class Diagnose(WithConditions):
-    """Find where a model fails and which physical effect it is missing."""
+    """Find where a model fails and which physical effect it is missing.
+
+    It writes DIR/diagnosis.json and DIR/report.html.
+    """
 
     def run(self) -> None:
         """Diagnose the model."""

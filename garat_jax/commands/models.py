@@ -109,6 +109,8 @@ class Convert:
         if not self.log.exists():
             raise UserError(f"LOG: there is no file {self.log}")
         check_files([self.map], "--map")
+        if self.out.resolve() == self.log.resolve():
+            raise UserError(f"--out {self.out} is LOG itself; give another name")
         check_out(self.out, ".csv", self.force)
         from garat_jax.diagnosis.convert_logs import convert_log
 

@@ -21,6 +21,7 @@ from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.suggest import suggest
 from garat_jax.diagnosis.timestep import count_timestep
+from garat_jax.diagnosis.units import after_number
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect, unit_at
 from garat_jax.errors import UserError, choose
@@ -118,7 +119,7 @@ def add(
 
 def said(estimate: Estimate) -> str:
     """Return an estimate with its interval and unit as a user reads them."""
-    unit = f" {estimate.unit}" if estimate.unit not in ("", "1") else ""
+    unit = after_number(estimate.unit)
     if not np.isfinite([estimate.low, estimate.high]).all():
         return f"{estimate.estimate:.4g}{unit} (the recordings do not tell it)"
     return f"{estimate.estimate:.4g}{unit} (95 %: {estimate.low:.4g} to {estimate.high:.4g})"

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from garat_jax.diagnosis.tables import damaged
 from garat_jax.errors import UserError, unknown_name
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -68,10 +69,11 @@ def read_bag(path: Path, sources: Sequence[str], clock: str) -> dict[str, Series
             they were recorded.
 
     Raises:
-        UserError: rosbags is not installed, the bag cannot be read, or it lacks a source.
+        UserError: rosbags is not installed, the bag cannot be read, or it lacks a source or the
+            definition of its message type.
     """
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise UserError(
@@ -80,25 +82,44 @@ def read_bag(path: Path, sources: Sequence[str], clock: str) -> dict[str, Series
     wanted = {text: parse_source(text) for text in sources}
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            topics = reader.topics
-            for source in wanted.values():
-                if source.topic not in topics:
-                    raise UserError(f"{path}: {unknown_name('topic', source.topic, topics)}")
-            chosen = {source.topic for source in wanted.values()}
-            connections = [c for c in reader.connections if c.topic in chosen]
-            found: dict[str, list[tuple[float, float]]] = {text: [] for text in wanted}
-            for connection, stamp, raw in reader.messages(connections):
-                message = reader.deserialize(raw, connection.msgtype)
-                stamp = (_header_stamp(message) if clock == "header" else 0) or stamp
-                time = 1e-9 * (stamp - reader.start_time)
-                for text, source in wanted.items():
-                    if source.topic == connection.topic:
-                        found[text].append((time, _value(message, source)))
-    except (AnyReaderError, OSError) as error:
-        raise UserError(f"{path}: cannot be read as a bag: {error}") from error
+            found = _rows(reader, wanted, clock)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
+    except Exception as error:  # what rosbags raises on damaged bags is not documented
+        raise damaged(path, "a bag", error) from error
     return {text: _series(path, text, rows) for text, rows in found.items()}
+
+
+def _rows(
+    reader: Any, wanted: Mapping[str, Source], clock: str
+) -> dict[str, list[tuple[float, float]]]:
+    """Return seconds and value of each message of an open bag, by the names of `wanted`."""
+    topics = reader.topics
+    for source in wanted.values():
+        if source.topic not in topics:
+            raise unknown_name("topic", source.topic, topics)
+    chosen = {source.topic for source in wanted.values()}
+    connections = [c for c in reader.connections if c.topic in chosen]
+    found: dict[str, list[tuple[float, float]]] = {text: [] for text in wanted}
+    for connection, stamp, raw in reader.messages(connections):
+        message = _message(reader, raw, connection)
+        stamp = (_header_stamp(message) if clock == "header" else 0) or stamp
+        time = 1e-9 * (stamp - reader.start_time)
+        for text, source in wanted.items():
+            if source.topic == connection.topic:
+                found[text].append((time, _value(message, source)))
+    return found
+
+
+def _message(reader: Any, raw: bytes, connection: Any) -> Any:
+    """Return what a message holds; its type, and those within, have to be defined."""
+    try:
+        return reader.deserialize(raw, connection.msgtype)
+    except KeyError as error:
+        raise UserError(
+            f"nothing defines the message type {error} of {connection.topic}, neither the bag nor "
+            "ROS 2 Humble; record as MCAP, which holds definitions, or take another topic"
+        ) from error
 
 
 def _series(path: Path, text: str, rows: list[tuple[float, float]]) -> Series:

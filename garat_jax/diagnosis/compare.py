@@ -22,7 +22,7 @@ from garat_jax.diagnosis.model_card import Model, check_same_machine, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.quality import Quality, assess
-from garat_jax.diagnosis.replay import Replay, Size, replay_with
+from garat_jax.diagnosis.replay import Replay, Size, lasting, replay, replay_with
 from garat_jax.diagnosis.residuals import Residuals, examine
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import Grid, choose_grid
@@ -37,8 +37,6 @@ from garat_jax.provenance import versions
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
 
 FORMAT = "garat-compare/1"
-HORIZONS = (0.2, 0.5, 1.0, 2.0)
-"""Seconds over which errors are told, besides the horizon of the stated error."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,18 +171,17 @@ def compare(
     say(say_horizon(recordings, stated))
     finer = Simulator(model, (), grid, 2)
     warnings = warn_of_divergence(simulator, finer, recordings, grid, stated)
-    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
     warnings += (STILL,) if is_still(segments) else ()
     played = {}
-    for horizon in sorted({stated, *(h for h in HORIZONS if h <= longest)}):
+    for horizon in sorted({stated, *lasting(recordings)}):
         say(f"predicting over {horizon:g} s")
         played[horizon] = replay_with(simulator, recordings, grid, horizon)
     error = _errors(played[stated], simulator, finer, grid)
     alternatives = []
     for other in also:
         say(f"predicting with {other.path}")
-        others = Simulator(other, (), grid)
-        replays = {h: replay_with(others, recordings, grid, h) for h in played}
+        wanted = dict.fromkeys(played, range(len(recordings)))
+        replays = dict(zip(played, replay(other, recordings, wanted), strict=True))
         of_other = replays[stated].error()
         alternatives.append(Alternative(str(other.path), of_other, _at_horizons(replays)))
     return Comparison(

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy import io
 
-from garat_jax.diagnosis.tables import read_table
+from garat_jax.diagnosis.tables import read_mat, read_table
 from garat_jax.errors import UserError
 
 FREE_PENDULUM_FILE = "SinglePendulumDataForParameterEstimation.mat"
@@ -53,6 +52,8 @@ MOTOR_PENDULUM_RUNS = {
     "energy_shaping_1kg": ("control_method_energy_shaping__data_measured_1kg.csv", 6.0),
 }
 """File, and the seconds that look untouched by hand."""
+MOTOR_PENDULUM_COLUMNS = ("time", "position", "velocity", "torque")
+"""Of each file: s, rad, rad/s, N m."""
 
 
 class Converted(NamedTuple):
@@ -87,22 +88,31 @@ def free_pendulum(folder: Path, out: Path) -> Converted:
         raise UserError(
             f"{folder}: there is no {FREE_PENDULUM_FILE}, the free pendulum's recording"
         )
+    content = read_mat(path, squeeze=False)
     try:
-        content = io.loadmat(path)
-        segments = {
-            kind: list(zip(content[f"Time_{key}"].flat, content[f"Y_{key}"].flat, strict=True))
-            for kind, key in (("fit", "id"), ("holdout", "vad"))
-        }
-    except (KeyError, ValueError, TypeError) as error:
-        raise UserError(f"{path}: no recording of the free pendulum: {error}") from error
-    written = {kind: [] for kind in segments}
-    for kind, recordings in segments.items():
-        for number, (time, state) in enumerate(recordings):
-            time = time.ravel()
-            columns = {"time": time - time[0], "qpos.pivot": state[0], "qvel.pivot": state[1]}
-            written[kind].append(write_csv(out / f"{kind}_{number}.csv", columns))
+        segments = {"fit": _segments(content, "id"), "holdout": _segments(content, "vad")}
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        raise UserError(
+            f"{path}: no recording of the free pendulum: {error}; expected cells Time_id and "
+            "Time_vad of times [T], Y_id and Y_vad of states [2, T]"
+        ) from error
+    written = {
+        kind: tuple(write_csv(out / f"{kind}_{i}.csv", columns) for i, columns in enumerate(made))
+        for kind, made in segments.items()
+    }
     model = _write_text(out / "free_pendulum.xml", FREE_PENDULUM_MJCF)
-    return Converted(model, tuple(written["fit"]), tuple(written["holdout"]))
+    return Converted(model, written["fit"], written["holdout"])
+
+
+def _segments(content: Mapping[str, np.ndarray], key: str) -> list[dict[str, np.ndarray]]:
+    """Return the columns [T] of each segment of the free pendulum: s, rad and rad/s."""
+    segments = []
+    cells = np.ravel(content[f"Time_{key}"]), np.ravel(content[f"Y_{key}"])
+    for cell, state in zip(*cells, strict=True):
+        time, (angle, speed) = np.asarray(cell, float).ravel(), np.asarray(state, float)
+        columns = np.stack([time - time[0], angle, speed])
+        segments.append(dict(zip(("time", "qpos.pivot", "qvel.pivot"), columns, strict=True)))
+    return segments
 
 
 def motor_pendulum(
@@ -122,7 +132,7 @@ def motor_pendulum(
     written = {}
     for run in (*fit, *holdout):
         name, seconds = MOTOR_PENDULUM_RUNS[run]
-        columns = read_table(folder / name).columns
+        columns = read_table(folder / name, MOTOR_PENDULUM_COLUMNS).columns
         kept = columns["time"] <= seconds
         written[run] = write_csv(
             out / f"{run}.csv",

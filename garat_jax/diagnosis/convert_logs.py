@@ -1,18 +1,25 @@
 """The command `garat convert`: a log of another kind becomes a recording, as a map file says."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import io
+from scipy.io.matlab import mat_struct
 
 from garat_jax.diagnosis.bags import Series, is_bag, read_bag
 from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.maps import ColumnMap, read_map
-from garat_jax.diagnosis.tables import DAMAGED, Table, check_samples, numbers_of, read_table
-from garat_jax.errors import UserError, unknown_name
+from garat_jax.diagnosis.tables import (
+    Table,
+    check_samples,
+    check_wanted,
+    read_mat,
+    read_npz,
+    read_table,
+)
+from garat_jax.errors import UserError
 
 TABLES = (".csv", ".parquet")
 KINDS = "a bag (folder, .bag, .mcap, .db3), .csv, .parquet, .npz or .mat"
@@ -93,19 +100,24 @@ def _at(series: Series, stamps: np.ndarray, held: bool) -> np.ndarray:
 
 def _from_arrays(log: Path, column_map: ColumnMap) -> dict[str, np.ndarray]:
     """Read NPZ and MAT files, whose arrays may have several columns and may be nested."""
-    arrays = _npz(log) if log.suffix.lower() == ".npz" else _mat(log)
-    raw = {}
-    for column in column_map.columns.values():
-        match = _ARRAY.fullmatch(column.source)
-        if match is None or match["name"] not in arrays:
-            name = column.source if match is None else match["name"]
-            raise UserError(f"{log}: {unknown_name('array', name, arrays)}")
-        raw[column.source] = _one_column(log, arrays[match["name"]], column.source, match["column"])
+    places = {source: _place(source) for source in column_map.sources}
+    names = [name for name, _ in places.values()]
+    arrays = read_npz(log, names) if log.suffix.lower() == ".npz" else _mat(log, names)
+    raw = {
+        source: _one_column(log, arrays[name], source, column)
+        for source, (name, column) in places.items()
+    }
     lengths = {name: len(values) for name, values in raw.items()}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise UserError(f"{log}: the arrays are not equally long: {listed}")
     return column_map.apply(raw)
+
+
+def _place(source: str) -> tuple[str, str | None]:
+    """Split `NAME[COLUMN]`; anything else is a name."""
+    match = _ARRAY.fullmatch(source)
+    return (match["name"], match["column"]) if match else (source, None)
 
 
 def _one_column(log: Path, array: np.ndarray, source: str, column: str | None) -> np.ndarray:
@@ -124,36 +136,26 @@ def _one_column(log: Path, array: np.ndarray, source: str, column: str | None) -
     return array
 
 
-def _npz(log: Path) -> dict[str, np.ndarray]:
-    try:
-        with log.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: numbers_of(log, archive, name) for name in archive.files}
-    except UserError:
-        raise
-    except DAMAGED as error:
-        raise UserError(f"{log}: not an NPZ archive; write it with numpy.savez") from error
+def _mat(log: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Read the arrays of numbers in a MAT file, some of which have to be there.
 
-
-def _mat(log: Path) -> dict[str, np.ndarray]:
-    """Read a MAT file; fields of structures are named `a.b`, cells `a.0`, `a.1` and so on."""
-    try:
-        content = io.loadmat(log, simplify_cells=True)
-    except NotImplementedError as error:
-        raise UserError(f"{log}: saved by MATLAB with -v7.3; save it again with -v7") from error
-    except Exception as error:  # what scipy raises on damaged files is not documented
-        raise UserError(f"{log}: cannot be read as MAT: {error}") from error
-    return _flatten({name: value for name, value in content.items() if not name.startswith("__")})
+    Fields of a structure are named `a.b`; cells, and the elements of an array of structures, `a.0`,
+    `a.1` and so on. One cell alone is named as if it were none.
+    """
+    arrays = _flatten(read_mat(log, squeeze=True))
+    check_wanted(log, names, arrays, "array")
+    return arrays
 
 
 def _flatten(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
     flat: dict[str, np.ndarray] = {}
     for name, value in content.items():
-        if isinstance(value, dict):
-            flat |= _flatten(value, f"{prefix}{name}.")
+        if isinstance(value, mat_struct):
+            fields = {field: getattr(value, field) for field in value._fieldnames}
+            flat |= _flatten(fields, f"{prefix}{name}.")
         elif isinstance(value, np.ndarray) and value.dtype == object:
-            flat |= _flatten(
-                {str(i): cell for i, cell in enumerate(value.flat)}, f"{prefix}{name}."
-            )
+            cells = {str(i): cell for i, cell in enumerate(value.flat)}
+            flat |= _flatten(cells, f"{prefix}{name}.")
         elif np.asarray(value).dtype.kind in "fiub":
             flat[prefix + name] = np.asarray(value, float)
     return flat

@@ -25,7 +25,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
-from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.segments import SHORTEST, choose_grid
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -33,6 +33,7 @@ from garat_jax.diagnosis.suggest import suggest
 from garat_jax.diagnosis.unseen import is_still, unseen
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
+from garat_jax.errors import UserError
 from garat_jax.provenance import versions
 
 ENOUGH = 250.0
@@ -118,13 +119,27 @@ def split(recordings: Sequence[Recording], holdout: Sequence[Recording]):
     border = 2 * len(whole.time) // 3
     before = tuple((a, min(b, border)) for a, b in whole.spans if a < border)
     after = tuple((max(a, border), b) for a, b in whole.spans if b > border)
+    before, after = _lasting(before), _lasting(after)
+    if not (before and after):
+        raise UserError(
+            f"{whole.name} is too short to hold out its last third; record for longer, or give "
+            "another recording to prove the result on"
+        )
     first = dataclasses.replace(whole, spans=before)
     last = dataclasses.replace(whole, name=f"{whole.name} (last third)", spans=after)
     return (first,), (last,), "on the last third of the only recording"
 
 
+def _lasting(spans: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+    """Return those spans that are long enough to be a segment."""
+    return tuple((a, b) for a, b in spans if b - a >= SHORTEST)
+
+
 def thin(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
-    """Leave out samples beyond `ENOUGH` a second where no command acts between them."""
+    """Leave out samples beyond `ENOUGH` a second where no command acts between them.
+
+    Spans of which too few would be left go; a recording of none but such stays as it is.
+    """
     return tuple(r if r.ctrl.shape[1] else _every(r, _excess(r)) for r in recordings)
 
 
@@ -133,7 +148,9 @@ def _excess(recording: Recording) -> int:
 
 
 def _every(r: Recording, step: int) -> Recording:
-    kept = [np.arange(a, b, step) for a, b in r.spans]
+    kept = [rows for a, b in r.spans if len(rows := np.arange(a, b, step)) >= SHORTEST]
+    if not kept:
+        return r
     borders = np.cumsum([0, *(len(k) for k in kept)])
     spans = tuple((int(a), int(b)) for a, b in itertools.pairwise(borders))
     rows = np.concatenate(kept)

@@ -4,6 +4,8 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
+from garat_jax.diagnosis.units import after_number
+
 MOST_NAMED = 4
 """Kinds that a sentence names of those that recordings cannot show."""
 
@@ -26,7 +28,7 @@ class Estimate(Interval):
     def __str__(self) -> str:
         known = math.isfinite(self.low) and math.isfinite(self.high)
         ends = f" [{self.low:.4g}, {self.high:.4g}]" if known else ""
-        return f"{self.estimate:.4g}{ends} {self.unit}"
+        return f"{self.estimate:.4g}{ends}{after_number(self.unit)}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,7 +177,7 @@ class Drift:
 
     def __str__(self) -> str:
         way = "falls" if self.end < self.begin else "rises"
-        unit = f" {self.change.unit}" if self.change.unit not in ("", "1") else ""
+        unit = after_number(self.change.unit)
         return (
             f"{self.parameter} of {self.effect} at {self.target} {way} from {self.begin:.3g} to "
             f"{self.end:.3g}{unit} within a recording"

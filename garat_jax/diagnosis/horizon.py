@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.measurements import Recording, longest_span
 from garat_jax.diagnosis.problem import AnyProblem, Predictor
 from garat_jax.diagnosis.segments import QUIET, Grid, Segments, cut
 from garat_jax.diagnosis.starts import Fit, settle
@@ -138,8 +138,8 @@ def cut_longer(
 
 def _possible(recordings: Sequence[Recording]) -> list[float]:
     """Return the horizons that some recording lasts for, longest first; the shortest always."""
-    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
-    return [h for h in HORIZONS if h <= max(longest, HORIZONS[-1])]
+    longest = max(longest_span(recordings), HORIZONS[-1])
+    return [h for h in HORIZONS if h <= longest]
 
 
 def _is_within(sizes: np.ndarray) -> bool:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from scipy import signal
 
-from garat_jax.diagnosis.columns import signals
+from garat_jax.diagnosis.columns import signals, torques
 from garat_jax.effects.base import DOFS_OF_JOINT, element_names
 from garat_jax.effects.units import at_slide
 
@@ -91,7 +91,8 @@ def missing_torque(model: mujoco.MjModel, recordings: "Sequence[Recording]") -> 
     stacked = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
     actuators = tuple(element_names(model, "actuator"))
     slides = tuple(signal.unit == "m/s" for signal in signals(model)[model.nq :])
-    return MissingTorque(_dof_names(model), actuators, slides, *stacked)
+    dofs = tuple(torque.name.removeprefix("torque.") for torque in torques(model))
+    return MissingTorque(dofs, actuators, slides, *stacked)
 
 
 def localise(missing: MissingTorque) -> list[Place]:
@@ -197,8 +198,3 @@ def _positions(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
         if DOFS_OF_JOINT[int(model.jnt_type[joint])] == 1:
             positions[:, model.jnt_dofadr[joint]] = qpos[:, model.jnt_qposadr[joint]]
     return positions
-
-
-def _dof_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    names = element_names(model, "joint")
-    return tuple(names[joint] or f"joint {joint}" for joint in model.dof_jntid)

@@ -143,7 +143,7 @@ def _column(name: str, table: Any) -> Column:
             raise UserError(f"[column] {name} {key} = {value!r}; expected a finite number")
     if numbers.get("sign", 1) not in (1, -1):
         raise UserError(f"[column] {name} sign = {numbers['sign']}; expected 1 or -1")
-    unit = table.get("unit")
+    unit = str(table["unit"]) if "unit" in table else None
     if unit is not None:
-        unit_of(name, str(unit))
+        unit_of(name, unit)
     return Column(table["from"], unit, **{key: float(value) for key, value in numbers.items()})

@@ -7,7 +7,7 @@ ball and free joints add `.0 .1 ...`. SI units.
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -107,6 +107,11 @@ def _read(path: str | Path, model: mujoco.MjModel, column_map: ColumnMap | None)
     column_map.check({"time": "s", **{s.name: s.unit for s in (*signals(model), *torques(model))}})
     raw = read_table(path, column_map.sources)
     return Table(raw.path, column_map.apply(raw.columns))
+
+
+def longest_span(recordings: Sequence[Recording]) -> float:
+    """Return for how many seconds recordings last without a gap, at most."""
+    return max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
 
 
 def noise(recording: Recording) -> np.ndarray:

@@ -125,13 +125,15 @@ def plan(
         first: One effect, or its name as `parse_place` reads it.
         second: The other.
         seconds: Length of the excitation.
-        seed: Draws the excitations.
+        seed: Draws the excitations; 0 or more.
         say: Told what is being done.
 
     Raises:
         UserError: The model has no actuators or one without limits, an effect is unknown, they are
-            the same, or one shows in nothing.
+            the same, or one shows in nothing, or the seed is negative.
     """
+    if seed < 0:
+        raise UserError(f"seed {seed}: expected 0 or more")
     first, second = (parse_place(p, model) if isinstance(p, str) else p for p in (first, second))
     places = (first, second)
     host = native_model(model.compile(engine="mujoco"))

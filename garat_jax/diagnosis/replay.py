@@ -8,13 +8,16 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.columns import signals
-from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.measurements import Recording, longest_span
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.segments import QUIET, Grid, Segments, choose_grid, cut, metric_spread
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.velocity import estimate_velocity
+
+HORIZONS = (0.2, 0.5, 1.0, 2.0)
+"""Seconds over which predictions are shown."""
 
 
 class Size(NamedTuple):
@@ -127,6 +130,12 @@ def replay(
     )
 
 
+def lasting(recordings: Sequence[Recording]) -> list[float]:
+    """Return those of `HORIZONS` for which some recording lasts without a gap."""
+    longest = longest_span(recordings)
+    return [horizon for horizon in HORIZONS if horizon <= longest]
+
+
 def replay_with(
     simulator: Simulator,
     recordings: Sequence[Recording],
@@ -144,13 +153,14 @@ def replay_with(
     settled = settle(problem, simulator.base, segments.start)
     residual = settled.residual.reshape(segments.measured.shape)
     of_state = signals(simulator.host)[: segments.measured.shape[2]]
-    return Replay(
+    played = Replay(
         horizon=horizon,
         names=tuple(s.name for s in of_state),
         units=tuple(s.unit for s in of_state),
         segments=segments,
         predicted=segments.measured + residual * segments.noise,
     )
+    return played.only(shown)
 
 
 def as_recordings(

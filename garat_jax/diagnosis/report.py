@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 
 from garat_jax import report
@@ -28,6 +27,7 @@ from garat_jax.diagnosis.report_data import (
     unseen_section,
 )
 from garat_jax.diagnosis.results import Diagnosis, Errors
+from garat_jax.diagnosis.units import after_number
 from garat_jax.diagnosis.view import View, look
 from garat_jax.report import Fact, Figure, Reproduce, Section, Table
 from garat_jax.runs import RunDirectory
@@ -269,8 +269,7 @@ def _where(places: Sequence[Place], view: View) -> list[Section]:
     if not places:
         return []
     dof = view.missing.dofs.index(places[0].signal)
-    joint = int(view.host.dof_jntid[dof])
-    unit = "m" if view.host.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "rad"
+    unit = "m" if view.missing.slides[dof] else "rad"
     law = ""
     if view.explained is not None:
         law = " The line is what the repaired model gives by the same computation."
@@ -387,5 +386,4 @@ def _parameters(diagnosis: Diagnosis, model: Model) -> list[Section]:
 
 def _estimate(name: str, e: Estimate) -> str:
     ends = f" ({e.low:.3g} to {e.high:.3g})" if np.isfinite([e.low, e.high]).all() else ""
-    unit = f" {e.unit}" if e.unit not in ("", "1") else ""
-    return f"{name} {e.estimate:.3g}{ends}{unit}"
+    return f"{name} {e.estimate:.3g}{ends}{after_number(e.unit)}"

@@ -283,7 +283,8 @@ def conditions_section(diagnosis: Diagnosis) -> list[Section]:
     text = "\n".join(f"- {name}: {d.sentence}" for name, d in diagnosis.conditions.items())
     caption = (
         "Effects of all conditions were found in the base recordings. Where a condition has one of "
-        "them again, it acts there in its place. All sizes were fitted to all recordings together."
+        "them again, it acts there in its place. Where the base condition and others are explained "
+        "well, sizes were fitted to their recordings together, without those held out."
     )
     return [Section("Under other conditions", text, tables=[Table(columns, rows, caption)])]
 

@@ -95,9 +95,7 @@ class Simulator:
         """
         timestep = Override("option", "", "timestep", grid.timestep / refine)
         spec = model.spec.copy()
-        host = model.spec.copy().compile()
         for effect in candidates:
-            effect.check(host)
             effect.unlock(spec)
         overrides = (*model.overrides, timestep)
         self._model = dataclasses.replace(model, spec=spec, overrides=overrides)

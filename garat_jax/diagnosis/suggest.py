@@ -52,7 +52,7 @@ def _suggestion(effect: Effect, missing: MissingTorque, torques) -> Suggestion |
     if element == "actuator":
         at = missing.actuators.index(name)
         return effect.suggested_by_commands(missing.ctrl[:, at], missing.drive[:, at])
-    if element != "joint" or missing.dofs.count(name) != 1:
+    if element != "joint" or name not in missing.dofs:
         return None
     dof = missing.dofs.index(name)
     return effect.suggested(missing.position[:, dof], *torques(dof))

@@ -1,13 +1,19 @@
-"""Read a file of columns: CSV, Parquet or NPZ, as arrays of numbers. Nothing is ever unpickled."""
+"""Read a file of columns: CSV, Parquet or NPZ, as arrays of numbers. Nothing is ever unpickled.
+
+The arrays of other NPZ files, and the variables of MAT files, are read here too.
+"""
 
 import csv
+import warnings
 import zipfile
 import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import io
 
 from garat_jax.errors import UserError, unknown_name
 
@@ -82,8 +88,13 @@ def read_table(path: str | Path, wanted: Collection[str] | None = None) -> Table
     except UserError:
         raise
     except DAMAGED as error:
-        detail = " ".join(str(error).split()) or type(error).__name__
-        raise UserError(f"{path}: cannot be read as {path.suffix[1:].upper()}: {detail}") from error
+        raise damaged(path, path.suffix[1:].upper(), error) from error
+
+
+def damaged(path: Path, kind: str, error: Exception) -> UserError:
+    """Describe in one line a file that is not of its kind, or no longer."""
+    detail = " ".join(str(error).split()) or type(error).__name__
+    return UserError(f"{path}: cannot be read as {kind}: {detail}")
 
 
 def check_samples(table: Table) -> None:
@@ -131,20 +142,37 @@ def _read_csv(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarra
     twice = [name for name in header if header.count(name) > 1]
     if twice:
         raise UserError(f"{path}: column {twice[0]!r} is there {header.count(twice[0])} times")
-    frame = pd.read_csv(
-        path,
-        header=None,
-        names=header,
-        index_col=False,
-        skiprows=1,
-        skip_blank_lines=False,
-        encoding="utf-8-sig",
-        on_bad_lines="error",
-        low_memory=False,
-        sep=separator,
-    )
+    frame = _rows_below(path, header, separator)
     filled = np.flatnonzero(frame.notna().any(axis=1))
     return _numbers(path, _only(path, frame.iloc[: filled[-1] + 1 if len(filled) else 0], wanted))
+
+
+def _rows_below(path: Path, header: list[str], separator: str) -> pd.DataFrame:
+    """Read what is below line 1 of a CSV file; a separator may end each row.
+
+    Raises:
+        UserError: The rows have more fields than line 1, so none is known to be its column's.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", pd.errors.ParserWarning)
+        try:
+            return pd.read_csv(
+                path,
+                header=None,
+                names=header,
+                index_col=False,
+                skiprows=1,
+                skip_blank_lines=False,
+                encoding="utf-8-sig",
+                on_bad_lines="error",
+                low_memory=False,
+                sep=separator,
+            )
+        except pd.errors.ParserWarning as error:
+            raise UserError(
+                f"{path}: rows have more fields than line 1 names ({len(header)}); expected as "
+                "many: name each column, or leave row names out (in R: row.names = FALSE)"
+            ) from error
 
 
 def _read_parquet(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
@@ -159,34 +187,76 @@ def _only(path: Path, frame: pd.DataFrame, wanted: Collection[str] | None) -> pd
     return frame.drop(columns=[name for name in frame.columns if name not in wanted])
 
 
-def check_wanted(path: Path, wanted: Collection[str], there: Collection[str]) -> None:
-    """Refuse a file that lacks a column that a map file asks for.
+def check_wanted(
+    path: Path, wanted: Collection[str], there: Collection[str], what: str = "column"
+) -> None:
+    """Refuse a file that lacks a column, or what else it holds, that a map file asks for.
 
     Raises:
         UserError: It does; the message has the nearest names.
     """
     for name in wanted:
         if name not in there:
-            raise UserError(f"{path}: {unknown_name('column', name, there)}")
+            raise UserError(f"{path}: {unknown_name(what, name, there)}")
 
 
 def _read_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
-    if not zipfile.is_zipfile(path):
-        raise UserError(f"{path}: not an NPZ archive; write it with numpy.savez")
-    columns = {}
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-        check_wanted(path, wanted or (), archive.files)
-        for name in archive.files if wanted is None else dict.fromkeys(wanted):
-            columns[name] = numbers_of(path, archive, name)
-            if columns[name].ndim != 1:
-                raise UserError(
-                    f"{path}: array {name!r} has shape {columns[name].shape}; "
-                    "expected one number a sample"
-                )
+    columns = read_npz(path, wanted)
+    for name, column in columns.items():
+        if column.ndim != 1:
+            raise UserError(
+                f"{path}: array {name!r} has shape {column.shape}; expected one number a sample"
+            )
     return columns
 
 
-def numbers_of(path: Path, archive: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+def read_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
+    """Read the arrays of an NPZ archive, of any shape.
+
+    Args:
+        path: The file.
+        wanted: Leave all other arrays unread; None reads every array.
+
+    Raises:
+        UserError: The file is damaged, or lacks an array, or one holds anything but numbers.
+    """
+    if not zipfile.is_zipfile(path):
+        raise UserError(f"{path}: not an NPZ archive; write it with numpy.savez")
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            check_wanted(path, wanted or (), archive.files, "array")
+            names = archive.files if wanted is None else dict.fromkeys(wanted)
+            return {name: _numbers_of(path, archive, name) for name in names}
+    except UserError:
+        raise
+    except DAMAGED as error:
+        raise damaged(path, "NPZ", error) from error
+
+
+def read_mat(path: Path, squeeze: bool) -> dict[str, Any]:
+    """Read the variables of a MAT file.
+
+    Args:
+        path: The file.
+        squeeze: Leave out dimensions of length 1, so that one structure or cell is no array.
+
+    Returns:
+        Numbers and text as arrays, structures as `scipy.io.matlab.mat_struct`; cells and arrays of
+        structures as arrays of objects.
+
+    Raises:
+        UserError: The file is damaged, or of MATLAB's version 7.3.
+    """
+    try:
+        content = io.loadmat(path, squeeze_me=squeeze, struct_as_record=False)
+    except NotImplementedError as error:
+        raise UserError(f"{path}: saved by MATLAB with -v7.3; save it again with -v7") from error
+    except Exception as error:  # what scipy raises on damaged files is not documented
+        raise damaged(path, "MAT", error) from error
+    return {name: value for name, value in content.items() if not name.startswith("__")}
+
+
+def _numbers_of(path: Path, archive: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     """Return an array of an NPZ archive; what is pickled stays unread.
 
     Raises:

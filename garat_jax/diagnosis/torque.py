@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.columns import torques
-from garat_jax.diagnosis.localise import missing_torque
+from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 
 
@@ -56,14 +56,17 @@ def compare_torques(
         model: The compiled model, native fields as its effects leave them.
         recordings: What was measured.
     """
+    spans = [
+        dataclasses.replace(recording, spans=(span,))
+        for recording in recordings
+        if recording.torque
+        for span in recording.spans
+    ]
+    missing = [(span, missing_torque(model, [span])) for span in spans]
     found = []
     for dof, signal in enumerate(torques(model)):
         joint = signal.name.partition(".")[2]
-        rows = [
-            _of_recording(model, recording, joint, dof)
-            for recording in recordings
-            if joint in recording.torque
-        ]
+        rows = [_of_span(span, m, joint, dof) for span, m in missing if joint in span.torque]
         if rows:
             measured, given, needed = (np.concatenate(c) for c in zip(*rows, strict=True))
             of_actuator, of_motion = _error(measured, given), _error(measured, needed)
@@ -72,16 +75,12 @@ def compare_torques(
     return tuple(found)
 
 
-def _of_recording(model: mujoco.MjModel, recording: Recording, joint: str, dof: int):
-    """Return measured, given and needed torque along a recording, [M] each."""
-    parts = []
-    for a, b in recording.spans:
-        span = dataclasses.replace(recording, spans=((a, b),))
-        m = missing_torque(model, [span])
-        measured = np.interp(m.time, recording.time[a:b], recording.torque[joint][a:b])
-        given = m.command[:, dof]
-        parts.append((measured, given, given + m.torque[:, dof]))
-    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+def _of_span(recording: Recording, missing: MissingTorque, joint: str, dof: int):
+    """Return measured, given and needed torque along a recording of one span, [M] each."""
+    ((a, b),) = recording.spans
+    measured = np.interp(missing.time, recording.time[a:b], recording.torque[joint][a:b])
+    given = missing.command[:, dof]
+    return measured, given, given + missing.torque[:, dof]
 
 
 def _error(measured: np.ndarray, modelled: np.ndarray) -> tuple[float, float]:

@@ -6,6 +6,11 @@ from typing import NamedTuple
 from garat_jax.errors import UserError, choose
 
 
+def after_number(unit: str) -> str:
+    """Return a unit as it follows a number; nothing where it is none."""
+    return f" {unit}" if unit not in ("", "1") else ""
+
+
 class Unit(NamedTuple):
     """A unit: the SI unit that it turns into, and its size in that."""
 

@@ -8,14 +8,11 @@ import mujoco
 from garat_jax.diagnosis.diagnose import thin
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
-from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.measurements import Recording, longest_span
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.replay import Replay, as_recordings, replay
+from garat_jax.diagnosis.replay import Replay, as_recordings, lasting, replay
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
-
-HORIZONS = (0.2, 0.5, 1.0, 2.0)
-"""Seconds over which errors are drawn."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +75,7 @@ def look(
     """
     recordings = thin(recordings)
     host = native_model(model.compile(engine="mujoco"))
-    longest = max(float(r.time[b - 1] - r.time[a]) for r in recordings for a, b in r.spans)
-    horizons = [h for h in HORIZONS if h <= longest] or [longest]
+    horizons = lasting(recordings) or [longest_span(recordings)]
     before = replay(model, recordings, dict.fromkeys(horizons, shown))
     after, explained = (), None
     if selected:

@@ -12,6 +12,7 @@ from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
 from garat_jax.diagnosis.segments import QUIET, Segments
+from garat_jax.dynamics import Override
 from garat_jax.runs import RunDirectory
 from tests import models
 
@@ -40,6 +41,14 @@ def test_a_true_model_is_at_the_noise_floor(recorded):
     found = compare(*read(recorded, "none"))
     assert found.error.before < 1.2 * found.error.noise_floor
     assert "near the sensors' noise" in found.sentence
+
+
+def test_another_model_is_scored_at_its_own_timestep(recorded):
+    model, recordings = read(recorded, "none")
+    coarse = dataclasses.replace(model, overrides=(Override("option", "", "timestep", 0.02),))
+    alone, found = compare(model, recordings), compare(coarse, recordings, also=[model])
+    assert found.error.before > 1.5 * alone.error.before
+    assert found.also[0].error == pytest.approx(alone.error.before, rel=0.01)
 
 
 def test_missing_friction_is_seen_and_placed(recorded):

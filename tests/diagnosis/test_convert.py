@@ -38,6 +38,52 @@ def test_free_pendulum_hangs_at_pi(tmp_path):
     assert data.qacc[0] == pytest.approx(expected, rel=1e-4)
 
 
+def cells(*arrays):
+    made = np.empty(len(arrays), object)
+    made[:] = arrays
+    return made
+
+
+TIMES, STATES = np.arange(50.0)[:, None] * 1e-3, np.zeros((2, 50))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"Y_vad": cells(STATES[:, :7])},
+        {"Y_vad": cells(STATES[:1])},
+        {"Y_vad": cells(STATES, STATES)},
+        {"Y_vad": cells("swing")},
+        {"Y_vad": STATES},
+        {"Time_vad": cells(TIMES[:0]), "Y_vad": cells(STATES[:, :0])},
+    ],
+)
+def test_other_segments_of_the_free_pendulum_are_refused(tmp_path, wrong):
+    right = {"Time_id": cells(TIMES), "Time_vad": cells(TIMES)}
+    right |= {"Y_id": cells(STATES), "Y_vad": cells(STATES)}
+    io.savemat(tmp_path / convert.FREE_PENDULUM_FILE, right)
+    convert.free_pendulum(tmp_path, tmp_path / "right")
+    io.savemat(tmp_path / convert.FREE_PENDULUM_FILE, right | wrong)
+    with pytest.raises(UserError, match=r"no recording of the free pendulum: .*; expected cells"):
+        convert.free_pendulum(tmp_path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_matlab_file_cut_short_is_refused(tmp_path):
+    path = tmp_path / convert.FREE_PENDULUM_FILE
+    io.savemat(path, {"Time_id": cells(TIMES), "Y_id": cells(STATES)})
+    path.write_bytes(path.read_bytes()[:900])
+    with pytest.raises(UserError, match=f"{path.name}: cannot be read as MAT: "):
+        convert.free_pendulum(tmp_path, tmp_path / "out")
+
+
+def test_another_run_of_the_motor_pendulum_is_refused(tmp_path):
+    name, _ = convert.MOTOR_PENDULUM_RUNS["ddp"]
+    (tmp_path / name).write_text("time,positions,velocity,torque\n0,0,0,0\n")
+    with pytest.raises(UserError, match="unknown column 'position'; did you mean positions"):
+        convert.motor_pendulum(tmp_path, tmp_path / "out", ["ddp"])
+
+
 def test_a_folder_without_the_recording_is_refused(tmp_path):
     with pytest.raises(UserError, match="there is no SinglePendulumData"):
         convert.free_pendulum(tmp_path, tmp_path / "out")

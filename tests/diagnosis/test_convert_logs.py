@@ -1,5 +1,7 @@
 """`garat convert`: real logs of every kind become the same recording."""
 
+import shutil
+import sqlite3
 import sys
 
 import numpy as np
@@ -30,10 +32,13 @@ OF_BAGS = COLUMNS.format(
 )
 
 
-def convert(folder, log, columns, time='time = "t"', head="") -> tuple[int, Recording | None]:
+def convert(
+    folder, log, columns, time='time = "t"', head="", force=False
+) -> tuple[int, Recording | None]:
     path, out = folder / "map.toml", folder / "data.csv"
     path.write_text(f'format = "garat-map/1"\n{head}\n[column]\n{time}\n{columns}')
-    status = cli.main(["convert", str(log), "--map", str(path), "--out", str(out)])
+    given = ["convert", str(log), "--map", str(path), "--out", str(out), *["--force"] * force]
+    status = cli.main(given)
     return status, Recording.read(out, MODEL) if status == 0 else None
 
 
@@ -67,6 +72,33 @@ def test_mat_with_cells_of_recordings_that_are_not_equally_long(tmp_path):
     io.savemat(tmp_path / "log.mat", cells)
     columns = OF_ARRAYS.replace("state[", "state.1[").replace('"u"', '"u.1"')
     check(convert(tmp_path, tmp_path / "log.mat", columns, 'time = "t.1"')[1])
+
+
+def test_mat_with_an_array_of_structures(tmp_path):
+    made = arrays()
+    runs = np.empty(2, [(name, object) for name in made])
+    runs[0], runs[1] = tuple(array[:5] for array in made.values()), tuple(made.values())
+    io.savemat(tmp_path / "log.mat", {"run": runs})
+    columns = OF_ARRAYS.replace("state[", "run.1.state[").replace('"u"', '"run.1.u"')
+    check(convert(tmp_path, tmp_path / "log.mat", columns, 'time = "run.1.t"')[1])
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 2)])
+@pytest.mark.parametrize("first", ["a note", {"t": 0.0}])
+def test_mat_with_structures_in_cells(tmp_path, shape, first):
+    made = np.empty(shape, object)
+    made.flat[:] = [first] + [arrays()] * (made.size - 1)
+    io.savemat(tmp_path / "log.mat", {"run": {"parts": made}})
+    columns = OF_ARRAYS.replace("state[", "run.parts.2.state[").replace('"u"', '"run.parts.2.u"')
+    check(convert(tmp_path, tmp_path / "log.mat", columns, 'time = "run.parts.2.t"')[1])
+
+
+def test_mat_without_the_array_names_the_nearest(tmp_path, capsys):
+    io.savemat(tmp_path / "log.mat", {"run": arrays()})
+    columns = OF_ARRAYS.replace("state[", "run.states[").replace('"u"', '"run.u"')
+    assert convert(tmp_path, tmp_path / "log.mat", columns, 'time = "run.t"')[0] == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "unknown array 'run.states'; did you mean run.state" in line
 
 
 @pytest.mark.parametrize("name", ["log.csv", "log.parquet"])
@@ -145,6 +177,34 @@ def test_the_clock_of_the_log_shifts_the_states_against_the_commands(tmp_path):
     check(recording, torque=np.append(STAMPS[1:], STAMPS[-1]))
 
 
+def database(folder):
+    (path,) = write_bag(folder, "sqlite3").glob("*.db3")
+    return shutil.copy(path, folder / "log.db3")
+
+
+def test_a_message_type_that_nothing_defines_is_named(tmp_path, capsys):
+    log = database(tmp_path)
+    bag = sqlite3.connect(log)
+    with bag:
+        bag.execute("UPDATE topics SET type = 'own_msgs/msg/Effort' WHERE name = '/effort'")
+    bag.close()
+    assert convert(tmp_path, log, OF_BAGS, time="")[0] == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{log}: nothing defines the message type 'own_msgs/msg/Effort' of /effort" in line
+    assert "take another topic" in line
+
+
+@pytest.mark.parametrize("kept", [1000, 5000, 0.5, 0.9])
+def test_a_bag_damaged_after_its_beginning_is_refused(tmp_path, capsys, kept):
+    log = database(tmp_path)
+    content = log.read_bytes()
+    begin = kept if kept > 1 else int(kept * len(content))
+    log.write_bytes(content[:begin] + bytes([7]) * (len(content) - begin))
+    assert convert(tmp_path, log, OF_BAGS, time="")[0] == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{log}: cannot be read as a bag: " in line
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -162,6 +222,7 @@ def test_refusals_of_bags(tmp_path, capsys, old, new, said):
     assert convert(tmp_path, log, OF_BAGS.replace(old, new, 1), time="")[0] == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
+    assert line.count(str(log)) <= 1
     assert not (tmp_path / "data.csv").exists()
 
 
@@ -190,9 +251,37 @@ def test_refusals_of_arrays(tmp_path, capsys, columns, time, said):
 
 
 def test_pickled_arrays_are_never_loaded(tmp_path, capsys):
-    np.savez(tmp_path / "log.npz", t=np.asarray([{}], dtype=object))
+    np.savez(tmp_path / "log.npz", **arrays() | {"t": np.asarray([{}], dtype=object)})
     assert convert(tmp_path, tmp_path / "log.npz", OF_ARRAYS)[0] == 2
-    assert "pickled Python objects, which are never loaded" in capsys.readouterr().err
+    assert "array 't' holds pickled Python objects, which are never" in capsys.readouterr().err
+
+
+def test_arrays_that_the_map_leaves_out_stay_unread(tmp_path, capsys):
+    others = {"info": np.asarray([{}], dtype=object), "names": np.asarray(["hinge"])}
+    np.savez(tmp_path / "log.npz", **arrays(), **others)
+    check(convert(tmp_path, tmp_path / "log.npz", OF_ARRAYS)[1])
+    columns = OF_ARRAYS.replace('"u"', '"inf"')
+    assert convert(tmp_path, tmp_path / "log.npz", columns, force=True)[0] == 2
+    assert "unknown array 'inf'; did you mean info?" in capsys.readouterr().err
+
+
+def test_one_array_under_the_name_of_an_archive_is_refused(tmp_path, capsys):
+    with (tmp_path / "log.npz").open("wb") as file:
+        np.save(file, STAMPS)
+    assert convert(tmp_path, tmp_path / "log.npz", OF_ARRAYS)[0] == 2
+    assert "log.npz: not an NPZ archive; write it with numpy.savez" in capsys.readouterr().err
+
+
+def test_a_recording_never_replaces_its_log(tmp_path, capsys):
+    log = tmp_path / "data.csv"
+    pd.DataFrame({"t": STAMPS, "a": ANGLE, "s": SPEED, "u": STAMPS}).to_csv(log, index=False)
+    raw = log.read_bytes()
+    columns = COLUMNS.format(angle="a", speed="s", torque="u")
+    for force in (False, True):
+        assert convert(tmp_path, log, columns, force=force)[0] == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"--out {log} is LOG itself; give another name" in line
+    assert log.read_bytes() == raw
 
 
 @pytest.mark.parametrize("name", ["log.mat", "log.npz", "log.mcap", "log.bag", "log.parquet"])

@@ -19,6 +19,7 @@ from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.effects import ActuatorDelay
+from garat_jax.errors import UserError
 from tests import models
 
 MODEL = Model("pendulum", __file__, __file__, models.spec(models.PENDULUM))
@@ -194,6 +195,8 @@ def test_hold_out_is_by_recording_and_of_a_single_one_its_last_third():
     assert first.spans == ((0, 33),)
     assert last.spans == ((33, 50),)
     assert "last third" in how
+    with pytest.raises(UserError, match="too short to hold out its last third"):
+        split([record(UNIFORM[:24])], ())
 
 
 def test_passive_recordings_are_thinned_and_driven_ones_are_not():
@@ -202,6 +205,8 @@ def test_passive_recordings_are_thinned_and_driven_ones_are_not():
     assert len(thin([passive])[0].time) == 50
     assert thin([passive])[0].spans == ((0, 50),)
     assert len(thin([fast])[0].time) == 100
+    parts = dataclasses.replace(passive, spans=((0, 80), (80, 95)))
+    assert thin([parts])[0].spans == ((0, 40),)
 
 
 def test_a_signal_that_never_changes_has_the_noise_of_its_kind():

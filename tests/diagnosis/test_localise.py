@@ -82,3 +82,18 @@ def test_contacts_and_slides_are_those_of_the_model():
     assert missing.slides == (True, True)
     weight = 0.5 * 9.81
     np.testing.assert_allclose(missing.contact, [[weight, 0.0]] * len(missing.time), atol=0.05)
+
+
+def test_a_place_names_the_direction_of_a_joint_that_has_several():
+    model = models.spec(models.TUMBLER).compile()
+    num = 100
+    qpos, spin = np.tile(model.qpos0, (num, 1)), np.zeros((num, model.nv))
+    spin[:, 4] = np.arange(num) * 0.05
+    recording = Recording(
+        "spinning.csv", np.arange(num) * 0.01, qpos, spin, np.zeros((num, 0)), {}, True,
+        ((0, num),), (),
+    )  # fmt: skip
+    missing = missing_torque(model, [recording])
+    turning = missing._replace(torque=missing.torque * (np.arange(model.nv) == 4))
+    assert missing.slides[:6] == (True, True, True, False, False, False)
+    assert {place.signal for place in localise(turning)} == {"free.4"}

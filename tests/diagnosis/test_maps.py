@@ -73,6 +73,12 @@ def test_scale_counts_before_the_offset(tmp_path):
     np.testing.assert_allclose(recording.qpos[0, 0], np.radians(-0.5 * 90 + 90))
 
 
+def test_a_unit_may_be_the_number_1(tmp_path):
+    text = MAP.replace('"torque"', '{ from = "torque", unit = 1 }')
+    recording = Recording.read(save(tmp_path), MODEL, read_map(write(tmp_path, text)))
+    np.testing.assert_allclose(recording.ctrl[:, 0], FOREIGN["torque"])
+
+
 def test_units_are_what_they_say():
     assert UNITS["rpm"].factor * 60 == pytest.approx(2 * np.pi)
     assert UNITS["deg"].factor * 180 == pytest.approx(np.pi)
@@ -89,6 +95,7 @@ def test_units_are_what_they_say():
         ('"qpos.hinge"', "qpos.hinge", "ctrl.ACTUATOR or torque.JOINT, in quotes"),
         ('"qpos.hinge"', '"angle.hinge"', "expected time, qpos.JOINT, qvel.JOINT"),
         ('"deg"', '"degs"', "unknown unit of qpos.hinge 'degs'; did you mean deg"),
+        ('"deg"', "2", "unknown unit of qpos.hinge '2'; known: %, 1, A, N, "),
         ('"deg"', '"rpm"', "qpos.hinge cannot be in 'rpm'; expected one of "),
         ('"deg"', '"mm"', "qpos.hinge cannot be in 'mm'; expected one of rad, mrad, deg, turn"),
         ('"ms"', '"deg"', "time cannot be in 'deg'; expected one of s, ms"),

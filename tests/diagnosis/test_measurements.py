@@ -257,6 +257,29 @@ def test_unreadable_files(tmp_path, name, content, said):
     assert said in refusal(path)
 
 
+def as_r_writes(table) -> str:
+    """R's write.table(table, sep = ","): a name before each row, which line 1 does not name."""
+    lines = [",".join(f'"{name}"' for name in table)]
+    rows = enumerate(zip(*table.values(), strict=True), 1)
+    lines += [",".join([f'"{number}"', *map(str, row)]) for number, row in rows]
+    return "\n".join(lines)
+
+
+def test_rows_with_more_fields_than_names_are_refused(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text(as_r_writes(columns()))
+    message = refusal(path)
+    assert "rows have more fields than line 1 names (4); expected as many" in message
+    assert "leave row names out (in R: row.names = FALSE)" in message
+
+
+def test_a_comma_may_end_each_row(tmp_path):
+    path = tmp_path / "run.csv"
+    header, *rows = save(tmp_path, columns()).read_text().splitlines()
+    path.write_text("\n".join([header, *(f"{row}," for row in rows)]))
+    assert len(Recording.read(path, MODEL).time) == 200
+
+
 def test_absent_file(tmp_path):
     assert "no such file" in refusal(tmp_path / "absent.csv")
 

@@ -75,3 +75,10 @@ def test_a_report_of_mixed_recordings_is_finite(mixed):
     said = compare(MODEL, mixed)
     assert all(np.isfinite(row["before"]) for row in said.error.per_signal.values())
     assert set(said.error.per_signal) == {"qpos.hinge", "qvel.hinge"}
+
+
+def test_a_replay_of_recordings_without_velocity_shows_none(mixed):
+    for chosen, names in (([0], ("qpos.hinge", "qvel.hinge")), ([1], ("qpos.hinge",))):
+        (shown,) = replay(MODEL, mixed, {0.5: chosen})
+        assert shown.names == names
+        assert np.isfinite(shown.error())

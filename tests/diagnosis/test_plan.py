@@ -49,6 +49,7 @@ def test_the_same_seed_plans_the_same(pendulum):
         (["--separate", "viscous_damping", "viscous_damping"], "are the same; name two effects"),
         (["--separate", "actuator_delay", "motor_gain"], "write actuator_delay@TARGET"),
         (["--separate", "viscous_damping", "motor_gain", "--seconds", "0"], "expected 2 to 600"),
+        (["--separate", "viscous_damping", "motor_gain", "--seed", "-1"], "-1: expected 0 or more"),
         (["--separate", "viscous_damping"], "--separate"),
     ],
 )

@@ -8,7 +8,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
-from garat_jax.dynamics import native_model
+from garat_jax.dynamics import Override, native_model
 from garat_jax.effects.transmission import Transmission
 from tests import models
 
@@ -27,6 +27,25 @@ def make_simulator(mjcf: str):
     grid = choose_grid([recording], host.opt.timestep)
     simulator = Simulator(model, make_candidates(model), grid)
     return simulator, cut([recording], grid, 0.25)
+
+
+def test_a_candidate_may_need_what_the_model_card_overrides():
+    armature = Override("joint", "hinge", "armature", 0.01)
+    spec = models.spec(models.PENDULUM)
+    model = Model("pendulum", __file__, __file__, spec, overrides=(armature,))
+    candidates = make_candidates(model)
+    (index,) = (i for i, c in enumerate(candidates) if c.kind == "backlash")
+    count = len(TIME)
+    recording = Recording(
+        "made", TIME, *np.zeros((2, count, 1)), np.ones((count, 1)), {}, True, ((0, count),), ()
+    )
+    grid = choose_grid([recording], model.compile(engine="mujoco").host.model.opt.timestep)
+    simulator, segments = Simulator(model, candidates, grid), cut([recording], grid, 0.25)
+    theta = simulator.base.copy()
+    theta[next(j for j, slot in enumerate(simulator.slots) if slot.effect == index)] = 0.02
+    thetas, starts = np.stack([simulator.base, theta]), np.stack([segments.start] * 2)
+    without, beside = simulator.predict(thetas, starts, segments)
+    assert np.abs(beside - without).max() > 1e-3
 
 
 @pytest.mark.parametrize("mjcf", [models.SLIDER, models.ARM])

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from garat_jax.diagnosis import torque as module
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.torque import compare_torques
 from tests import models
@@ -56,7 +57,8 @@ def test_without_measured_torques_there_is_nothing_to_compare():
     assert compare_torques(model, [dataclasses.replace(track(0.0), torque={})]) == ()
 
 
-def test_each_dof_of_a_ball_joint_is_compared():
+def tumble():
+    """A free box with a ball joint that a known torque turns; two torques are measured."""
     model = models.spec(models.TUMBLER).compile()
     data = mujoco.MjData(model)
     data.qpos[2] = 20.0
@@ -70,7 +72,29 @@ def test_each_dof_of_a_ball_joint_is_compared():
     time, qpos, qvel, torque = (np.asarray(column) for column in zip(*rows, strict=True))
     measured = {"ball.1": torque, "free.0": np.zeros(len(time))}
     nothing, spans = np.zeros((len(time), 0)), ((0, len(time)),)
-    recording = Recording("made.csv", time, qpos, qvel, nothing, measured, True, spans, ())
+    return model, Recording("made.csv", time, qpos, qvel, nothing, measured, True, spans, ())
+
+
+def test_each_dof_of_a_ball_joint_is_compared():
+    model, recording = tumble()
     errors = compare_torques(model, [recording])
     assert [(e.joint, e.unit) for e in errors] == [("free.0", "N"), ("ball.1", "N m")]
     assert errors[1].motion_fit_percent > 80
+
+
+def test_the_motion_is_inverted_once_a_span(monkeypatch):
+    model, whole = tumble()
+    parts = dataclasses.replace(whole, spans=((0, 250), (250, 500)))
+    computed = []
+
+    def counted(model, recordings):
+        computed.extend(span for recording in recordings for span in recording.spans)
+        return missing_torque(model, recordings)
+
+    missing_torque = module.missing_torque
+    monkeypatch.setattr(module, "missing_torque", counted)
+    errors = compare_torques(model, [parts, dataclasses.replace(whole, torque={})])
+    assert computed == [(0, 250), (250, 500)]
+    halves = [dataclasses.replace(whole, spans=(span,)) for span in parts.spans]
+    assert compare_torques(model, halves) == errors
+    assert [e.joint for e in errors] == ["free.0", "ball.1"]
