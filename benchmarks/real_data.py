@@ -1,7 +1,9 @@
 """Diagnose published models of real rigs from their real recordings, and record what was found.
 
-`python benchmarks/real_data.py FOLDER --out DIR`, where FOLDER holds `free_pendulum/` and
-`motor_pendulum/` as their authors publish them.
+`python benchmarks/real_data.py FOLDER --out DIR`, where FOLDER holds
+`free_pendulum/SinglePendulumDataForParameterEstimation.mat` and, in `motor_pendulum/`,
+`control_method_METHOD__data_measured.csv` for ddp, sac and energy_shaping, and
+`control_method_energy_shaping__data_measured_1kg.csv`.
 """
 
 import argparse
@@ -44,12 +46,19 @@ def run_case(name: str, folder: Path, out: Path, command: str) -> dict[str, Any]
     write_diagnosis(run, result, model.name, sections)
     sys.stdout.write(f"{name}\n{result}\n\n")
     said = ("effect", "target", "share", "error_after", "passes", "why")
+    selected = [
+        {
+            "effect": c.effect,
+            "target": c.target,
+            "indistinguishable_from": [str(other) for other in c.indistinguishable_from],
+            **c.parameters,
+        }
+        for c in result.selected
+    ]
     row = {
         "case": name,
         "verdict": result.verdict,
-        "selected": [
-            {"effect": c.effect, "target": c.target, **c.parameters} for c in result.selected
-        ],
+        "selected": selected,
         "error": result.error,
         "candidates": [{name: getattr(c, name) for name in said} for c in result.candidates],
         "seconds": result.seconds,

@@ -181,7 +181,11 @@ def real_data() -> str:
     result = read("real_data")
 
     def named(row: dict[str, Any]) -> str:
-        return ", ".join(f"{c['effect']} at {c['target']}" for c in row["selected"]) or "–"
+        found = (
+            " or ".join((f"{c['effect']} at {c['target']}", *c["indistinguishable_from"]))
+            for c in row["selected"]
+        )
+        return "; ".join(found) or "–"
 
     rows = [
         (
