@@ -14,12 +14,13 @@ def garat(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferConfig:
 
 
 def garat_paper(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferConfig:
-    """GARAT with the paper's numbers, and our choices where it has none; kept for comparison.
+    """GARAT with the paper's numbers and some choices of ours; kept to show what that gives.
 
     From the paper: the transformer's PPO, discount and trace, the discriminator's learning rate,
-    one step of it an update, no offset of the reward. Of the libraries that it used: an initial
-    standard deviation of 1. Ours: the L2 coefficient, the order of the updates, an output that is
-    a change of the action, the discriminator's inputs, training with the transformer's mean action.
+    one step of it an update, no offset of the reward. Not in the paper: the transformer's initial
+    standard deviation, 1 as in the usual libraries. Ours: the L2 coefficient, the order of the two
+    updates, an output that is a change of the action, the discriminator's inputs, training in the
+    grounded source with the transformer's mean action.
     """
     settings = GARATConfig(
         transformer=PPOConfig(),  # Desai et al. 2020, appendix

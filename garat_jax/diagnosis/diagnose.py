@@ -85,6 +85,7 @@ def diagnose(
     outcome = explain(problem, settled.start, say, lambda p, t: cut_longer(p, everything, grid, t))
     problem = outcome.problem
     error = _errors(problem, outcome, host, how, grid.timestep)
+    explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
     found = Diagnosis(
         model=str(model.path),
         data=tuple(r.name for r in fitted),
@@ -100,7 +101,7 @@ def diagnose(
         drifts=find_drifts(problem, outcome.best, everything) if outcome.best else (),
         next_experiment=next_experiment((*outcome.selected, *outcome.candidates[:1]), host),
         warnings=warnings,
-        unseen=unseen(problem, outcome.before),
+        unseen=unseen(problem, outcome.before, explaining),
         still=is_still(problem.segments),
         left=(),
     )

@@ -1,9 +1,11 @@
 """Which effects recordings cannot show, because nothing in them would make such an effect act."""
 
+from collections.abc import Collection
+
 import numpy as np
 
 from garat_jax.diagnosis.evidence import Evidence
-from garat_jax.diagnosis.findings import Unseen
+from garat_jax.diagnosis.findings import Named, Unseen
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import SCREENED
 from garat_jax.diagnosis.segments import QUIET, Segments
@@ -26,11 +28,18 @@ def is_still(segments: Segments) -> bool:
     return not np.any(segments.spread > QUIET * segments.noise)
 
 
-def unseen(problem: Problem[Simulator], current: Fit) -> tuple[Unseen, ...]:
+def unseen(
+    problem: Problem[Simulator], current: Fit, seen: Collection[Named] = ()
+) -> tuple[Unseen, ...]:
     """List the candidates that would change the signals by less than noise hides.
 
     Each is tried at its usual sizes (`Effect.starts`), and with each of its parameters if they act
     alone; initial states are projected out, as where candidates are scored.
+
+    Args:
+        problem: The recordings and the model with every candidate.
+        current: A fit.
+        seen: Those of which the recordings show a larger size.
     """
     simulator, theta = problem.simulator, current.theta
     fitted = np.flatnonzero(problem.fitted)
@@ -46,4 +55,8 @@ def unseen(problem: Problem[Simulator], current: Fit) -> tuple[Unseen, ...]:
     shown = {t.effect for t in (*trials, *alone) if size[list(t.rows)].max() > SEEN}
     hidden = dict.fromkeys(t.effect for t in trials if t.effect not in shown)
     effects = [simulator.effects[index] for index in hidden]
-    return tuple(Unseen(e.kind, e.target, tuple(p.name for p in e.parameters())) for e in effects)
+    return tuple(
+        Unseen(e.kind, e.target, tuple(p.name for p in e.parameters()))
+        for e in effects
+        if Named(e.kind, e.target) not in seen
+    )

@@ -6,6 +6,15 @@ import numpy as np
 import pytest
 
 from garat_jax import cli
+from garat_jax.diagnosis.compare import read_recordings
+from garat_jax.diagnosis.diagnose import make_candidates
+from garat_jax.diagnosis.findings import Named
+from garat_jax.diagnosis.model_card import load_model
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.unseen import unseen
 from tests import models
 
 
@@ -39,10 +48,10 @@ def test_a_diagnosis_of_still_recordings_says_what_they_cannot_show(still, tmp_p
     assert "where:" not in printed  # what torque is missing is noise
     content = json.loads((out / "diagnosis.json").read_text())
     assert content["verdict"] == "adequate" and content["still"]
-    unseen = {(one["effect"], one["target"]): one["parameters"] for one in content["unseen"]}
-    assert unseen["motor_gain", "actuator/motor"] == ["scale"]
-    assert ("viscous_damping", "joint/hinge") in unseen
-    assert ("encoder_offset", "joint/hinge") not in unseen  # at rest it hangs straight down
+    hidden = {(one["effect"], one["target"]): one["parameters"] for one in content["unseen"]}
+    assert hidden["motor_gain", "actuator/motor"] == ["scale"]
+    assert ("viscous_damping", "joint/hinge") in hidden
+    assert ("encoder_offset", "joint/hinge") not in hidden  # at rest it hangs straight down
     page = (out / "report.html").read_text()
     assert "but the recordings excite nothing" in page
     assert "<h2>What these recordings cannot show</h2>" in page
@@ -53,3 +62,20 @@ def test_a_comparison_with_still_recordings_says_that_it_means_little(still, tmp
     model, files = still
     assert cli.main(["compare", model, *files, "--out", str(tmp_path / "run")]) == 0
     assert "warning: the recordings excite nothing" in capsys.readouterr().out
+
+
+def test_an_effect_that_explains_much_is_not_called_unseen(still):
+    path, files = still
+    model = load_model(path)
+    recordings = read_recordings(model, files)
+    grid = choose_grid(recordings, 0.002)
+    simulator = Simulator(model, make_candidates(model), grid)
+    segments = cut(recordings, grid, 0.5)
+    everywhere = np.ones(len(segments.start), bool)
+    problem = Problem(simulator, simulator, segments, everywhere, grid.interval)
+    settled = settle(problem, simulator.base, segments.start)
+    damping = Named("viscous_damping", "joint/hinge")
+    hidden = {Named(one.effect, one.target) for one in unseen(problem, settled)}
+    assert damping in hidden
+    seen = unseen(problem, settled, {damping})
+    assert {Named(one.effect, one.target) for one in seen} == hidden - {damping}
