@@ -16,8 +16,8 @@ NOT_THERE = "Unable to initialize backend"
 def num_cores() -> int:
     """Return how many of the machine's cores this process may use.
 
-    One thread for each is enough: where there are more threads than cores, they wait for each
-    other, and a step of eight small simulations takes ten times as long.
+    One thread for each is enough. More wait for each other: on a core that other work shares, a
+    step of eight small simulations takes ten times as long.
     """
     if hasattr(os, "sched_getaffinity"):  # not everywhere
         return len(os.sched_getaffinity(0))

@@ -22,7 +22,7 @@ from garat_jax.diagnosis.model_card import Model, check_same_machine, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.quality import Quality, assess
-from garat_jax.diagnosis.replay import Replay, Size, lasting, replay, replay_with
+from garat_jax.diagnosis.replay import Replay, Size, lasting_horizons, replay, replay_with
 from garat_jax.diagnosis.residuals import Residuals, examine
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import Grid, choose_grid
@@ -173,7 +173,7 @@ def compare(
     warnings = warn_of_divergence(simulator, finer, recordings, grid, stated)
     warnings += (STILL,) if is_still(segments) else ()
     played = {}
-    for horizon in sorted({stated, *lasting(recordings)}):
+    for horizon in sorted({stated, *lasting_horizons(recordings)}):
         say(f"predicting over {horizon:g} s")
         played[horizon] = replay_with(simulator, recordings, grid, horizon)
     error = _errors(played[stated], simulator, finer, grid)

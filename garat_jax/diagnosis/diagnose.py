@@ -120,7 +120,7 @@ def split(recordings: Sequence[Recording], holdout: Sequence[Recording]):
     border = 2 * len(whole.time) // 3
     before = tuple((a, min(b, border)) for a, b in whole.spans if a < border)
     after = tuple((max(a, border), b) for a, b in whole.spans if b > border)
-    before, after = _lasting(before), _lasting(after)
+    before, after = _long_enough(before), _long_enough(after)
     if not (before and after):
         raise UserError(
             f"{whole.name} is too short to hold out its last third; record for longer, or give "
@@ -131,7 +131,7 @@ def split(recordings: Sequence[Recording], holdout: Sequence[Recording]):
     return (first,), (last,), "on the last third of the only recording"
 
 
-def _lasting(spans: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+def _long_enough(spans: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
     """Return those spans that are long enough to be a segment."""
     return tuple((a, b) for a, b in spans if b - a >= SHORTEST)
 

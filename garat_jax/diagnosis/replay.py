@@ -130,7 +130,7 @@ def replay(
     )
 
 
-def lasting(recordings: Sequence[Recording]) -> list[float]:
+def lasting_horizons(recordings: Sequence[Recording]) -> list[float]:
     """Return those of `HORIZONS` for which some recording lasts without a gap."""
     longest = longest_span(recordings)
     return [horizon for horizon in HORIZONS if horizon <= longest]

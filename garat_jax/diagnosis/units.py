@@ -1,4 +1,4 @@
-"""Units that a map file may name, as factors to SI units."""
+"""Units that a map file may name, as factors to SI units, and how a unit follows a number."""
 
 import math
 from typing import NamedTuple

@@ -10,7 +10,7 @@ from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording, longest_span
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.replay import Replay, as_recordings, lasting, replay
+from garat_jax.diagnosis.replay import Replay, as_recordings, lasting_horizons, replay
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
 
@@ -75,7 +75,7 @@ def look(
     """
     recordings = thin(recordings)
     host = native_model(model.compile(engine="mujoco"))
-    horizons = lasting(recordings) or [longest_span(recordings)]
+    horizons = lasting_horizons(recordings) or [longest_span(recordings)]
     before = replay(model, recordings, dict.fromkeys(horizons, shown))
     after, explained = (), None
     if selected:
