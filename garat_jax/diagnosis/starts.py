@@ -168,22 +168,36 @@ def settle_starts(problem: Problem, theta, start, lin: Linearisation, iterations
         change = start_step(problem, lin, lin.residual, damping, HELD)
         before = np.sum(lin.residual**2, 1)
         promised = before - promised_costs(lin, lin.residual, change)
-        open_still = promised >= SETTLED * before
-        if not np.any(open_still):
+        is_open = promised >= SETTLED * before
+        if not np.any(is_open):
             break
-        starts = start + change * problem.segments.start_unit
-        trial = linearise(problem, theta, starts, (), (), lin.start)
+        starts = start + np.where(is_open[:, None], change, 0.0) * problem.segments.start_unit
+        trial = _linearised_again(problem, theta, starts, lin, is_open)
         fall = before - np.sum(trial.residual**2, 1)
         better = fall > 0
         start = np.where(better[:, None], starts, start)
         lin = choose(better, trial, lin)
         later = np.where(is_stale, damping, np.maximum(damping, 1e-5) * 100.0)
         damping = np.where(better, damping * 0.1, later)
-        again = open_still & (is_stale | better) & (fall < KEPT_PROMISE * promised)
+        again = is_open & (is_stale | better) & (fall < KEPT_PROMISE * promised)
         if np.any(again):
             lin = measured_anew(problem, theta, start, lin, again)
         is_stale = np.where(again, False, is_stale | better)
     return start, lin
+
+
+def _own(theta, chosen) -> np.ndarray:
+    """Return the parameters of some segments, where each has its own."""
+    return theta[chosen] if np.ndim(theta) > 1 else theta
+
+
+def _linearised_again(problem: Problem, theta, start, lin: Linearisation, chosen) -> Linearisation:
+    """Return a linearisation with the residual of some segments at other initial states."""
+    own, near = _own(theta, chosen), lin.start[chosen]
+    residual = lin.residual.copy()
+    moved = linearise(problem.take(chosen), own, start[chosen], (), (), near)
+    residual[chosen] = moved.residual
+    return lin._replace(residual=residual)
 
 
 def measured_anew(problem: Problem, theta, start, lin: Linearisation, chosen) -> Linearisation:
@@ -196,9 +210,10 @@ def measured_anew(problem: Problem, theta, start, lin: Linearisation, chosen) ->
         lin: The linearisation there.
         chosen: Which segments, [S] bool.
     """
-    own = theta[chosen] if np.ndim(theta) > 1 else theta
     some = problem.take(chosen)
-    fresh = linearise(some, own, start[chosen], (), (), residual=lin.residual[chosen])
+    fresh = linearise(
+        some, _own(theta, chosen), start[chosen], (), (), residual=lin.residual[chosen]
+    )
     sensitivity = lin.start.copy()
     sensitivity[chosen] = fresh.start
     return lin._replace(start=sensitivity)
