@@ -29,12 +29,12 @@ class Jumping:
     def predict(self, theta, start, segments) -> np.ndarray:
         predicted = self.smooth.predict(theta, start, segments)
         after = np.linspace(0, 1, predicted.shape[2])[:, None]
+        names = np.stack([segments.recording, segments.first], axis=1)
         for row, values in zip(predicted, theta, strict=True):
-            for segment, own in enumerate(
-                np.broadcast_to(values, (len(row), np.shape(values)[-1]))
-            ):
-                rng = np.random.default_rng([segment, *own.view(np.uint64)])
-                row[segment] += self.size * rng.normal(size=2) * (after > rng.random())
+            every = np.broadcast_to(values, (len(row), np.shape(values)[-1]))
+            for signals, name, own in zip(row, names, every, strict=True):
+                rng = np.random.default_rng([*name, *own.view(np.uint64)])
+                signals += self.size * rng.normal(size=2) * (after > rng.random())
         return predicted
 
 
