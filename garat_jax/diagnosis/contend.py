@@ -74,7 +74,7 @@ def fit_contenders(
     chosen = likely[:CONTENDERS]
     chosen += [s for s in likely[CONTENDERS:] if cosine(s, likely[0]) > EQUIVALENT]
     for score in chosen:
-        rival = min(rival, *(c.fit.cost[problem.fitted].sum() for c in contenders), np.inf)
+        rival = min([rival, *(c.fit.cost[problem.fitted].sum() for c in contenders)])
         hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
         if hopeless and not alike and len(contenders) > 1:
