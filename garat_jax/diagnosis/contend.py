@@ -52,7 +52,6 @@ def fit_contenders(
     refinable: Sequence[int],
     scores: Sequence[Score],
     say: Callable[[str], None],
-    rival: float,
 ) -> list[Contender]:
     """Fit the candidates that may be the missing effect.
 
@@ -62,7 +61,6 @@ def fit_contenders(
         refinable: Indices of those of them in whose place a refinement may come.
         scores: What screening says, best first.
         say: Told what is being done.
-        rival: Cost on the fitted segments that something else reached, as for `fit`.
     """
     contenders = _fit_refined(problem, current, refinable, scores, say)
     done = {c.score.effect for c in contenders}
@@ -74,7 +72,7 @@ def fit_contenders(
     chosen = likely[:CONTENDERS]
     chosen += [s for s in likely[CONTENDERS:] if cosine(s, likely[0]) > EQUIVALENT]
     for score in chosen:
-        rival = min([rival, *(c.fit.cost[problem.fitted].sum() for c in contenders)])
+        rival = min((c.fit.cost[problem.fitted].sum() for c in contenders), default=np.inf)
         hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
         if hopeless and not alike and len(contenders) > 1:

@@ -240,7 +240,6 @@ def _round(
     floor: Floor,
     say: Callable[[str], None],
     refinable: Sequence[int] = (),
-    rival: float = np.inf,
 ) -> Judged:
     """Screen the candidates, fit the likely ones and judge them all.
 
@@ -252,13 +251,10 @@ def _round(
         floor: The noise floor.
         say: Told what is being done.
         refinable: Those of them in whose place a refinement may come.
-        rival: Cost on the fitted segments that something else reached; see `fit`.
     """
     gap = is_above(problem, metric, current, floor)
     scores = screen(problem, current, held)
-    contenders = []
-    if gap:
-        contenders = fit_contenders(problem, current, refinable, scores, say, rival)
+    contenders = fit_contenders(problem, current, refinable, scores, say) if gap else []
     contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
     contenders = _refine(problem, metric, current, scores, contenders, floor, say)
     contenders = with_twins(problem, current, scores, contenders, say)
@@ -286,8 +282,7 @@ def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, 
         say(f"looking for what would be missing beside {candidate.named}")
         floor = noise_floor(problem, metric, contender.fit)
         effects = [*held, contender.score.effect]
-        rival = min((path.fit.cost[problem.fitted].sum() for path in paths), default=np.inf)
-        then = _round(problem, metric, contender.fit, effects, floor, say, rival=rival)
+        then = _round(problem, metric, contender.fit, effects, floor, say)
         paths.append(Path(candidate, contender, then))
     best = min(paths, key=lambda path: path.fit.cost.sum())
     others = [path.fit for path in paths if not best.is_like(path)]

@@ -27,7 +27,7 @@ def contenders_of(integrator: str):
     problem = dataclasses.replace(problem, fitted=np.arange(len(starts)) % 4 > 0)
     current, said = settle(problem, problem.simulator.base, starts), []
     scores = screen(problem, current)
-    first = fit_contenders(problem, current, (), scores, said.append, np.inf)
+    first = fit_contenders(problem, current, (), scores, said.append)
     return with_twins(problem, current, scores, first, said.append), said
 
 
