@@ -257,6 +257,7 @@ def _round(
     contenders = fit_contenders(problem, current, refinable, scores, say) if gap else []
     contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
     contenders = _refine(problem, metric, current, scores, contenders, floor, say)
+    contenders = _fill_out(problem, metric, contenders, floor, say)
     contenders = with_twins(problem, current, scores, contenders, say)
     num_tests = len([score for score in scores if not score.excluded])
     contenders = with_evidence(problem, current, contenders, num_tests)
@@ -320,34 +321,50 @@ def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:
 
 
 def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):
-    """Replace the best contender where a refinement, or more of its law, certainly explains more.
-
-    Its other names go with it: what replaces it has names of its own.
+    """Replace the best contender where a refinement of its law certainly explains more.
 
     Screening prefers the simpler law. A refinement's threshold hides it there; one without waits
     for the next round, where other effects rival it, if the simpler law proves itself.
     """
-
-    def refinements(best: Contender, contenders: list[Contender]) -> list[Contender]:
-        proves_itself = held_out_gain(problem, metric, current, best.fit).low > 0
-        names = [c for c in contenders if c.fit.residual is best.fit.residual]
-        found = [fit_refinements(problem, current, c, scores, say, proves_itself) for c in names]
-        return [contender for some in found for contender in some]
-
-    def further(best: Contender, _) -> list[Contender]:
-        return fit_further(problem, best, say)
-
-    for find in (refinements, further):
-        best = min(contenders, key=lambda c: c.fit.cost.sum(), default=None)
-        if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
-            break
-        for contender in find(best, contenders):
-            if leads(problem, contender.fit, best.fit):
-                names = [c for c in contenders if c.fit.residual is best.fit.residual]
-                replaced = {contender.score.effect, *(c.score.effect for c in names)}
-                others = (c for c in contenders if c.score.effect not in replaced)
-                contenders, best = [contender, *others], contender
+    best = _best(contenders)
+    if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
+        return contenders
+    proves_itself = held_out_gain(problem, metric, current, best.fit).low > 0
+    names = [c for c in contenders if c.fit.residual is best.fit.residual]
+    for name in names:
+        for refined in fit_refinements(problem, current, name, scores, say, proves_itself):
+            if leads(problem, refined.fit, best.fit):
+                contenders, best = _replaced(contenders, best, refined), refined
     return contenders
+
+
+def _fill_out(problem, metric: Metric, contenders, floor: Floor, say):
+    """Replace the best contender, and those that it does not lead, where more of their laws does.
+
+    Of two that explain the same, one may be the truth without a part that screening left out.
+    """
+    best = _best(contenders)
+    if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
+        return contenders
+    fits = {id(c.fit.residual): c for c in [*contenders, best]}  # names share one
+    for rival in fits.values():
+        if rival is best or not leads(problem, best.fit, rival.fit):
+            for fuller in fit_further(problem, rival, say):
+                if leads(problem, fuller.fit, rival.fit):
+                    contenders = _replaced(contenders, rival, fuller)
+    return contenders
+
+
+def _best(contenders: Sequence[Contender]) -> Contender | None:
+    """Return the contender that fits best, if there is any."""
+    return min(contenders, key=lambda contender: contender.fit.cost.sum(), default=None)
+
+
+def _replaced(contenders: Sequence[Contender], old: Contender, new: Contender) -> list[Contender]:
+    """Put one contender in another's place; the other's names go, as the new one has its own."""
+    names = (c.score.effect for c in contenders if c.fit.residual is old.fit.residual)
+    replaced = {new.score.effect, *names}
+    return [new, *(c for c in contenders if c.score.effect not in replaced)]
 
 
 def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:

@@ -7,7 +7,6 @@ import pytest
 
 from garat_jax.diagnosis import rank
 from garat_jax.diagnosis.contend import fit_contenders, with_twins
-from garat_jax.diagnosis.findings import Interval
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import settle
@@ -55,9 +54,32 @@ def test_the_names_of_a_fit_go_where_more_of_its_law_explains_more(monkeypatch):
         one, fit=dataclasses.replace(one.fit, residual=one.fit.residual / 2)
     )
     monkeypatch.setattr(rank, "is_above", lambda *_: True)
-    monkeypatch.setattr(rank, "held_out_gain", lambda *_: Interval(0.0, 0.0, 0.0))
-    monkeypatch.setattr(rank, "fit_refinements", lambda *_: [])
     monkeypatch.setattr(rank, "fit_further", lambda *_: [fuller])
     monkeypatch.setattr(rank, "leads", lambda *_: True)
-    (kept,) = rank._refine(None, None, None, [], [one, other], None, print)
+    (kept,) = rank._fill_out(None, None, [one, other], None, print)
     assert kept is fuller
+
+
+def test_more_of_a_law_is_tried_of_all_that_fit_as_well(monkeypatch):
+    (one, other), _ = contenders_of("Euler")
+
+    def with_error(contender, error):
+        residual = error * one.fit.residual
+        return dataclasses.replace(
+            contender, fit=dataclasses.replace(contender.fit, residual=residual)
+        )
+
+    best, as_good, worse = with_error(one, 1.0), with_error(other, 1.001), with_error(one, 3.0)
+    worse = dataclasses.replace(worse, score=dataclasses.replace(worse.score, effect=2))
+    fuller, tried = with_error(other, 0.5), []
+
+    def fit_further(_, contender, say):
+        tried.append(contender)
+        return [fuller] if contender is as_good else []
+
+    monkeypatch.setattr(rank, "is_above", lambda *_: True)
+    monkeypatch.setattr(rank, "fit_further", fit_further)
+    monkeypatch.setattr(rank, "leads", lambda _, a, b: a.cost.sum() < 0.9 * b.cost.sum())
+    kept = rank._fill_out(None, None, [best, as_good, worse], None, print)
+    assert [id(c) for c in tried] == [id(best), id(as_good)]
+    assert [id(c) for c in kept] == [id(fuller), id(best), id(worse)]
