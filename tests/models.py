@@ -62,6 +62,23 @@ SLIDER = """
 </mujoco>
 """
 
+DRONE = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody><body name="frame" pos="0 0 1"><freejoint name="root"/>
+    <geom name="hull" type="box" size="0.12 0.1 0.03" mass="0.8" contype="0" conaffinity="0"/>
+    <site name="centre"/>
+    <body name="load" pos="0 0 -0.05"><joint name="swing" type="ball" damping="0.002"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.2" size="0.01" mass="0.15"
+            contype="0" conaffinity="0"/></body></body></worldbody>
+  <actuator>
+    <motor name="thrust" site="centre" gear="0 0 1 0 0 0" ctrlrange="0 20"/>
+    <motor name="roll" site="centre" gear="0 0 0 1 0 0" ctrlrange="-1 1"/>
+    <motor name="twist" joint="swing" gear="0 0 0.5"/>
+  </actuator>
+</mujoco>
+"""
+
 MUSCLE = """
 <mujoco>
   <worldbody><body name="upper">

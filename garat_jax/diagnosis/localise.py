@@ -14,6 +14,7 @@ from scipy import signal
 
 from garat_jax.diagnosis.columns import signals, torques
 from garat_jax.effects.base import DOFS_OF_JOINT, element_names
+from garat_jax.effects.gear import gear_of
 from garat_jax.effects.units import at_slide
 
 if TYPE_CHECKING:
@@ -163,6 +164,7 @@ def _of_span(model: mujoco.MjModel, recording: "Recording", span: slice):
     acceleration = signal.savgol_filter(velocity, size, 2, deriv=1, delta=interval, axis=0)
     speed = signal.savgol_filter(velocity, size, 2, axis=0)
     data = mujoco.MjData(model)
+    gears = np.asarray([gear_of(model, actuator) for actuator in range(model.nu)])
     rows = []
     for k in range(len(time)):
         data.qpos[:], data.qvel[:] = recording.qpos[span][k], speed[k]
@@ -171,7 +173,7 @@ def _of_span(model: mujoco.MjModel, recording: "Recording", span: slice):
         needed, load = data.qfrc_inverse.copy(), data.qfrc_bias.copy()
         contact = _contact_torque(model, data)
         mujoco.mj_fwdActuation(model, data)
-        drive = data.actuator_force * model.actuator_gear[:, 0]
+        drive = data.actuator_force * gears
         rows.append((needed, load, contact, data.qfrc_actuator.copy(), drive))
     needed, load, contact, given, drive = (np.asarray(c) for c in zip(*rows, strict=True))
     both = signal.savgol_filter(np.hstack([given, drive]), size, 2, axis=0)

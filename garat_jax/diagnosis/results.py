@@ -233,10 +233,9 @@ class Diagnosis:
             lines.append(f"  not shown by these recordings: {list_unseen(self.unseen)}")
         for c in self.candidates[:6]:
             fitted = f", held-out error {c.error_after:.3g}, stability {c.stability:.2f}"
-            lines.append(
-                f"  {'*' if c.passes else ' '} {c.named}: {c.sizes}; share {c.share:.2f}"
-                f"{fitted if math.isfinite(c.error_after) else ' expected'}; {c.why}"
-            )
+            share = f"share {c.share:.2f}{fitted if math.isfinite(c.error_after) else ' expected'}"
+            said = "; ".join(part for part in (c.sizes, share, c.why) if part)
+            lines.append(f"  {'*' if c.passes else ' '} {c.named}: {said}")
         for rung in self.ladder:
             errors = f"fit {rung.error_fit:.4g}, held-out {rung.error_holdout:.4g}"
             lines.append(f"  {self.added(rung)}: {errors}")

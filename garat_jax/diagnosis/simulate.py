@@ -19,6 +19,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
 from garat_jax.dynamics import Override
 from garat_jax.effects import Effect, Parameter
+from garat_jax.errors import UserError
 
 BATCH_SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
@@ -176,21 +177,37 @@ class Simulator:
 
         Returns:
             Changes of the predictions, [P, S, L, num_signals].
+
+        Raises:
+            UserError: An effect at its nominal lets no simulation stay finite.
         """
         result = np.empty((len(theta), *segments.measured.shape))
         program = self._program(self._acting(base[None]))
-        _, path = self._in_batches(program, segments, base[None], start[None])
+        alone, path = self._in_batches(program, segments, base[None], start[None])
         for (way, _), rows in self._ways(theta, base).items():
             both = np.concatenate([base[None], theta[rows]])
             starts = np.broadcast_to(start, (len(both), *start.shape))
-            acting, along = self._acting(both), None
+            chosen = self._blind if way == "at once" else self._acting(both)
             if way == "along":
-                run, along = self._along(acting), path[0]
+                run, along = self._along(chosen), path[0]
             else:
-                run = self._program(self._blind if way == "at once" else acting)
+                run, along = self._program(chosen), None
             changed = self._in_batches(run, segments, both, starts, along)[0]
+            if _any_stays_finite(alone[0]) and not _any_stays_finite(changed[0]):
+                raise self._unstable(chosen, base, start, segments)
             result[rows] = changed[1:] - changed[0]
         return result
+
+    def _unstable(self, chosen: Sequence[int], base, start, segments: Segments) -> UserError:
+        """Name, of some effects, the one with which no simulation stays finite at its nominal."""
+
+        def stays_finite(i: int) -> bool:
+            signals, _ = self._in_batches(self._program((i,)), segments, base[None], start[None])
+            return _any_stays_finite(signals[0])
+
+        effect = self.effects[next((i for i in chosen if not stays_finite(i)), chosen[0])]
+        named = f"{effect.kind} at {effect.target}"
+        return UserError(f"no simulation with {named} stays finite, even at its nominal")
 
     def _ways(self, theta: np.ndarray, base: np.ndarray) -> dict[tuple[str, str], list[int]]:
         """Sort rows by how their change is had, and by what moves unless that is at once."""
@@ -353,3 +370,8 @@ class Simulator:
         below = jnp.minimum(place.astype(int), len(path) - 2)
         fraction = (place - below)[:, None]
         return (1 - fraction) * path[below] + fraction * path[below + 1]
+
+
+def _any_stays_finite(signals: np.ndarray) -> bool:
+    """Say whether the prediction of any segment is finite to its end, [S, L, num_signals]."""
+    return bool(np.isfinite(signals).all(axis=(1, 2)).any())

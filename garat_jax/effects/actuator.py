@@ -1,6 +1,7 @@
 """Effects at an actuator's output: gain, limit, back-EMF and the motor's curve.
 
 Torques are those at the joint, behind the actuator's gear: MuJoCo's actuator force times `gear`.
+At a site, or a joint of several dofs, it is the force or torque along the gear's direction.
 """
 
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ import numpy as np
 from flax import struct
 
 from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+from garat_jax.effects.gear import gear_in, gear_of
 from garat_jax.errors import UserError
 
 UNLIMITED = 1e9
@@ -61,11 +63,10 @@ def largest_command(host: mujoco.MjModel, actuator: str) -> float:
 def largest_torque(host: mujoco.MjModel, actuator: str) -> float:
     """Return the torque [N m] at the joint under the largest command, as the model has it."""
     index = element_id(host, "actuator", actuator)
-    gear = abs(float(host.actuator_gear[index, 0]))
     force = abs(float(host.actuator_gainprm[index, 0])) * largest_command(host, actuator)
     if host.actuator_forcelimited[index]:
         force = min(force, float(np.abs(host.actuator_forcerange[index]).max()))
-    return force * gear
+    return force * abs(gear_of(host, index))
 
 
 def limits_within(torque: np.ndarray) -> tuple[float, ...]:
@@ -173,7 +174,7 @@ class TorqueSaturation(Effect):
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Narrow the range of the actuator's force."""
         index = element_id(model.host, "actuator", self.name)
-        gear = abs(float(model.host.actuator_gear[index, 0]))
+        gear = abs(gear_of(model.host, index))
         limit = jnp.where(jnp.asarray(self.limit) < UNLIMITED, self.limit / gear, jnp.inf)
         ranges = model["actuator_forcerange"]
         low, high = jnp.maximum(ranges[index, 0], -limit), jnp.minimum(ranges[index, 1], limit)
@@ -182,7 +183,7 @@ class TorqueSaturation(Effect):
     def export(self, spec: mujoco.MjSpec) -> str:
         """Narrow the range of the actuator's force."""
         actuator = spec.actuator(self.name)
-        limit = float(self.limit) / abs(float(actuator.gear[0]))
+        limit = float(self.limit) / abs(gear_in(spec, actuator))
         low, high = actuator.forcerange if _has_forcerange(actuator) else (-limit, limit)
         actuator.forcerange = np.array([max(low, -limit), min(high, limit)])
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
@@ -236,7 +237,7 @@ class BackEmf(Effect):
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Lower the bias by the coefficient over gear squared: bias is in actuator coordinates."""
         index = element_id(model.host, "actuator", self.name)
-        gear = float(model.host.actuator_gear[index, 0])
+        gear = gear_of(model.host, index)
         bias = model["actuator_biasprm"]
         return {"actuator_biasprm": bias.at[index, 2].add(-self.coefficient / gear**2)}
 
@@ -244,7 +245,7 @@ class BackEmf(Effect):
         """Lower the bias by the coefficient over gear squared."""
         actuator = spec.actuator(self.name)
         make_affine(actuator)
-        actuator.biasprm[2] -= float(self.coefficient) / actuator.gear[0] ** 2
+        actuator.biasprm[2] -= float(self.coefficient) / gear_in(spec, actuator) ** 2
         return ""
 
 
@@ -342,7 +343,7 @@ class MotorCurve(Effect):
         del state
         host = model.host
         index = element_id(host, "actuator", self.name)
-        slope = float(host.actuator_gainprm[index, 0] * host.actuator_gear[index, 0])
+        slope = float(host.actuator_gainprm[index, 0]) * gear_of(host, index)
         command = clamped(host, ctrl)[index]
         torque = self._curve(command * slope)
         return ctrl.at[index].set((torque / slope).astype(ctrl.dtype)), None, memory

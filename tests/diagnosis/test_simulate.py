@@ -1,7 +1,13 @@
 """Programs are compiled for the candidates that act, and agree where these do nothing."""
 
+from collections.abc import Sequence
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 from garat_jax.diagnosis.diagnose import make_candidates
 from garat_jax.diagnosis.measurements import Recording
@@ -9,7 +15,10 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import Override, native_model
+from garat_jax.effects import Effect, MotorGain
+from garat_jax.effects.base import ModelView
 from garat_jax.effects.transmission import Transmission
+from garat_jax.errors import UserError
 from tests import models
 
 TIME = np.arange(101) * 0.005
@@ -17,15 +26,26 @@ HARDLY = 1e-9
 """Size at which a candidate acts without being felt, relative to its parameter's scale."""
 
 
-def make_simulator(mjcf: str):
-    """Return a model with every candidate, and segments that begin where it falls and is pushed."""
+@struct.dataclass
+class Broken(MotorGain):
+    """A gain that is no number at its nominal."""
+
+    kind: ClassVar[str] = "broken"
+    acts: ClassVar[bool] = True
+
+    def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
+        return ctrl * jnp.log(self.scale) / jnp.log(self.scale), None, memory
+
+
+def make_simulator(mjcf: str, candidates: Sequence[Effect] = ()):
+    """Return a model with candidates, or every one, in segments where it falls and is pushed."""
     model = Model("model", __file__, __file__, models.spec(mjcf))
     host = native_model(model.compile(engine="mujoco"))
     states = np.tile(host.qpos0, (len(TIME), 1)), np.zeros((len(TIME), host.nv))
     ctrl = 0.3 * np.sign(np.sin(20 * TIME))[:, None] * np.ones(host.nu)
     recording = Recording("made", TIME, *states, ctrl, {}, True, ((0, len(TIME)),), ())
     grid = choose_grid([recording], host.opt.timestep)
-    simulator = Simulator(model, make_candidates(model), grid)
+    simulator = Simulator(model, candidates or make_candidates(model), grid)
     return simulator, cut([recording], grid, 0.25)
 
 
@@ -48,7 +68,7 @@ def test_a_candidate_may_need_what_the_model_card_overrides():
     assert np.abs(beside - without).max() > 1e-3
 
 
-@pytest.mark.parametrize("mjcf", [models.SLIDER, models.ARM])
+@pytest.mark.parametrize("mjcf", [models.SLIDER, models.ARM, models.DRONE])
 def test_a_candidate_that_does_nothing_predicts_what_the_model_does_without_it(mjcf):
     simulator, segments = make_simulator(mjcf)
     alone = simulator.predict(simulator.base[None], segments.start[None], segments)[0]
@@ -62,3 +82,12 @@ def test_a_candidate_that_does_nothing_predicts_what_the_model_does_without_it(m
         theta[j] += HARDLY * p.scale * (-1 if theta[j] >= p.high else 1)
         beside = simulator.predict(theta[None], segments.start[None], segments)[0]
         assert np.abs(beside - alone).max() < 1e-5, (effect.kind, effect.target)
+
+
+def test_an_effect_that_breaks_the_model_at_its_nominal_is_named():
+    effects = (MotorGain("actuator/shoulder"), Broken("actuator/elbow"))
+    simulator, segments = make_simulator(models.ARM, effects)
+    theta = simulator.base.copy()
+    theta[0] = 0.9
+    with pytest.raises(UserError, match="no simulation with broken at actuator/elbow stays finite"):
+        simulator.linear_change(theta[None], simulator.base, segments.start, segments)

@@ -96,6 +96,66 @@ def test_back_emf_is_in_joint_units_and_adds_to_a_servo(mjcf):
     np.testing.assert_allclose(with_emf - plain, -0.6)
 
 
+def at_a_site(mjcf: str) -> str:
+    """Let the slider's motor push a site along the same axis in place of the joint."""
+    site = '<body name="puck" pos="0 0 -0.2005"><site name="middle"/>'
+    moved = mjcf.replace('<body name="puck" pos="0 0 -0.2005">', site)
+    return moved.replace('joint="along"', 'site="middle" gear="3 0 0 0 0 0"')
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "mjx"])
+@pytest.mark.parametrize(
+    "effect",
+    [
+        MotorGain("actuator/push", 0.8),
+        TorqueSaturation("actuator/push", limit=2.0),
+        BackEmf("actuator/push", 0.5),
+        MotorCurve("actuator/push", saturation=2.5, linear=1.0),
+        BackEmf("actuator/push"),  # at its nominal
+        MotorCurve("actuator/push"),
+    ],
+    ids=lambda effect: effect.kind,
+)
+def test_a_law_at_a_site_is_that_at_the_joint(engine, effect):
+    at_joint = SLIDER.replace('joint="along"', 'joint="along" gear="3"')
+    sites = (
+        at_a_site(SLIDER)
+        .replace("3 0 0 0 0 0", "0 0 3 0 0 0")
+        .replace("<site name=", '<site euler="0 90 0" name=')
+    )
+    commands = 1.5 * jnp.sin(0.3 * jnp.arange(20.0))[:, None]
+
+    def path(mjcf: str) -> np.ndarray:
+        world = dynamics.compile(spec(mjcf), effects=(effect,), engine=engine)
+
+        def step(state, command):
+            state = dynamics.step(world, state, command, 5)
+            return state, jnp.concatenate([state.qpos, state.qvel])
+
+        start = dynamics.initial_state(world, jnp.zeros(2), jnp.zeros(2))
+        return np.asarray(jax.jit(lambda: jax.lax.scan(step, start, commands)[1])())
+
+    expected = path(at_joint)
+    assert np.all(np.isfinite(expected))
+    assert np.ptp(expected[:, 1]) > 0.01
+    for mjcf in (at_a_site(SLIDER), sites):
+        np.testing.assert_allclose(path(mjcf), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "effect", [TorqueSaturation("actuator/push", 2.0), BackEmf("actuator/push", 0.5)]
+)
+def test_a_law_at_a_site_is_exported_as_that_at_the_joint(effect):
+    models = []
+    for mjcf in (SLIDER.replace('joint="along"', 'joint="along" gear="3"'), at_a_site(SLIDER)):
+        exported = spec(mjcf)
+        effect.export(exported)
+        models.append(exported.compile())
+    for field in ("actuator_forcerange", "actuator_biasprm"):
+        np.testing.assert_allclose(getattr(models[1], field), getattr(models[0], field))
+        assert np.all(np.isfinite(getattr(models[1], field)))
+
+
 def test_a_lag_is_the_mean_of_the_exact_solution():
     world = dynamics.compile(spec(RIG), effects=(ActuatorLag("all", 0.01),), engine="mujoco")
     effect, view = world.effects[0], dynamics.view(world)
@@ -175,7 +235,13 @@ def test_play_is_suggested_within_the_travel():
         ("actuator_delay", ["s"], ["s"]),
     ],
 )
-def test_an_actuator_has_the_units_of_the_joint_that_it_drives(kind, at_hinge, at_slide):
-    for mjcf, target, units in ((PENDULUM, MOTOR, at_hinge), (SLIDER, "actuator/push", at_slide)):
+def test_an_actuator_has_the_units_of_what_it_drives(kind, at_hinge, at_slide):
+    turning = at_a_site(SLIDER).replace("3 0 0 0 0 0", "0 0 0 3 0 0")
+    for mjcf, target, units in (
+        (PENDULUM, MOTOR, at_hinge),
+        (SLIDER, "actuator/push", at_slide),
+        (at_a_site(SLIDER), "actuator/push", at_slide),
+        (turning, "actuator/push", at_hinge),
+    ):
         host = spec(mjcf).compile()
         assert [unit_at(p, host, target) for p in CATALOGUE[kind].parameters()] == units
