@@ -108,8 +108,8 @@ def fit_refinements(
     return [
         _fit(problem, current, refined, rival, say)
         for score in scores
-        if _refines(problem, score.effect, simple)
-        and (refined := _refined(problem, score, best.fit.theta, [simple]))
+        if refines(problem, score.effect, simple)
+        and (refined := as_refined(problem, score, best.fit.theta, [simple]))
         and (not hidden_only or problem.num_listed(score.effect) > 1)
     ]
 
@@ -139,8 +139,8 @@ def _fit_refined(
     for score in scores:
         if score.excluded or score.share < LIKELY:
             continue
-        simpler = [i for i in added if _refines(problem, score.effect, i)]
-        if refined := _refined(problem, score, current.theta, simpler):
+        simpler = [i for i in added if refines(problem, score.effect, i)]
+        if refined := as_refined(problem, score, current.theta, simpler):
             own = [j for i in simpler for j in columns_of(simulator.slots, i).values()]
             theta = current.theta.copy()
             theta[own] = simulator.base[own]
@@ -158,13 +158,13 @@ def _acts(problem: Problem, effect: int, theta: np.ndarray) -> bool:
     return any(theta[j] != none[name] for name, j in columns.items())
 
 
-def _refines(problem: Problem, finer: int, simpler: int) -> bool:
+def refines(problem: Problem, finer: int, simpler: int) -> bool:
     """Say whether one effect's law refines another's at its place."""
     one, other = (problem.simulator.effects[i] for i in (finer, simpler))
     return one.target == other.target and other.kind in one.refines
 
 
-def _refined(problem: Problem, score: Score, theta: np.ndarray, simpler: Sequence[int]):
+def as_refined(problem: Problem, score: Score, theta: np.ndarray, simpler: Sequence[int]):
     """Return the score of a law that begins as simpler ones were fitted; None if it cannot.
 
     Args:

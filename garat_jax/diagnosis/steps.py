@@ -1,4 +1,7 @@
-"""The effects added so far: what became superfluous goes, what fits better takes its place."""
+"""The effects added so far: what became superfluous goes, what fits better takes its place.
+
+A law is superfluous, too, where another at its place that refines it can do all that both do.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -6,11 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, complete
+from garat_jax.diagnosis.contend import Contender, as_refined, complete, refines
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import leads
 from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.simulate import columns_of
 from garat_jax.diagnosis.starts import Fit
 
 
@@ -39,15 +43,40 @@ def prune(problem: Problem, steps: list[Step], current: Fit, tried: list[Step], 
     """Drop those effects that became superfluous: without them the cost stays as it is."""
     kept = steps
     for step in tried:
-        others = [s.effect for s in kept if s.effect != step.effect]
+        others = [s for s in kept if s.effect != step.effect]
         if not others:
             break
         say(f"trying without {step.candidate.named}")
-        without = _fit_only(problem, current, others, current.cost[problem.fitted].sum())
+        others, without = _without(problem, current, others, step)
         if not leads(problem, current, without):
-            kept = [other for other in kept if other.effect != step.effect]
-            current = without
+            kept, current = others, without
     return (steps if len(kept) == len(steps) else refitted(problem, kept, current)), current
+
+
+def _without(problem: Problem, current: Fit, others: list[Step], step: Step):
+    """Fit again without a step; what its law did, a kept law that refines it does from now on.
+
+    Returns:
+        The other steps and the fit with them alone.
+    """
+    theta, free = _only(problem, current, [other.effect for other in others])
+    simulator, heirs = problem.simulator, []
+    for other in others:
+        score, contender = other.contender.score, other.contender
+        if refines(problem, other.effect, step.effect) and (
+            refined := as_refined(problem, score, current.theta, [step.effect])
+        ):
+            whole = tuple(columns_of(simulator.slots, other.effect).values())
+            for j, value in refined.start.items():
+                theta[j] = value + (theta[j] if simulator.base[j] == 0.0 else 0.0)
+            free += [j for j in whole if j not in free]
+            contender = dataclasses.replace(
+                contender, score=dataclasses.replace(score, columns=whole)
+            )
+        heirs.append(other._replace(contender=contender))
+    rival = current.cost[problem.fitted].sum()
+    start, sensitivity = current.start, current.sensitivity
+    return heirs, fit(problem, theta, start, free, rival=rival, sensitivity=sensitivity)
 
 
 def refitted(problem: Problem, steps: list[Step], current: Fit) -> list[Step]:
@@ -112,10 +141,10 @@ def _fit_instead(problem: Problem, current: Fit, others: Sequence[int], instead:
     return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
 
 
-def _fit_only(problem: Problem, current: Fit, effects: Sequence[int], rival=np.inf) -> Fit:
+def _fit_only(problem: Problem, current: Fit, effects: Sequence[int]) -> Fit:
     """Fit again with some of the selected effects, the others back at no effect."""
     theta, free = _only(problem, current, effects)
-    return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
+    return fit(problem, theta, current.start, free, sensitivity=current.sensitivity)
 
 
 def _only(problem: Problem, current: Fit, effects: Sequence[int]) -> tuple[np.ndarray, list[int]]:

@@ -14,8 +14,14 @@ from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
-from garat_jax.diagnosis.steps import Step, swap
-from garat_jax.effects import MotorGain, QuadraticDrag, TorqueOffset, ViscousDamping
+from garat_jax.diagnosis.steps import Step, prune, swap
+from garat_jax.effects import (
+    AsymmetricFriction,
+    MotorGain,
+    QuadraticDrag,
+    TorqueOffset,
+    ViscousDamping,
+)
 from tests.diagnosis.pendulum import MODEL, add_damping, record
 
 AT = "joint/hinge"
@@ -88,3 +94,34 @@ def test_the_true_effect_stays(problem):
     assert [step.effect for step in steps] == [DAMPING, OFFSET]
     assert steps[0].candidate.indistinguishable_from == (Named("quadratic_drag", AT),)
     assert current is before
+
+
+def test_a_law_goes_where_one_that_refines_it_can_do_what_both_do():
+    """Damping and dry friction in one direction are together less than asymmetric friction."""
+    damped = functools.partial(add_damping, size=DAMPED)
+    recordings = [
+        record(damped, seed, torque=lambda speed: -0.08 if speed > 0 else 0.0) for seed in range(2)
+    ]
+    effects = (ViscousDamping(AT), AsymmetricFriction(AT))
+    grid = choose_grid(recordings, 0.002)
+    coarse, finer = (Simulator(MODEL, effects, grid, refine) for refine in (1, 2))
+    _, segments = choose_horizon(coarse, recordings, grid)
+    problem = Problem(coarse, finer, segments, np.ones(len(segments.start), bool), 0.004)
+    steps, free = [], []
+    names = [slot.parameter.name for slot in coarse.slots]
+    for effect, name in enumerate(("coefficient", "coulomb_positive")):
+        free.append(names.index(name))
+        score = Score(effect, (free[-1],), (0.0,), {}, 0.5, 0.0, True, np.zeros(0))
+        fitted = fit_with(problem, *free)
+        added = Candidate(effects[effect].kind, AT, {}, 0.5, 0.0, 0.0, None, 1.0, (), True, "")
+        steps.append(Step(added, Contender(score, fitted), fitted, []))
+    (kept,), current = prune(problem, steps, steps[-1].fit, steps[:1], lambda line: None)
+    assert kept.effect == 1
+    assert kept.fit is current
+    assert {*kept.contender.score.columns} == {*current.free} == {1, 2, 3, 4}
+    found = dict(zip(names, current.theta, strict=True))
+    assert found["coefficient"] == 0.0
+    assert found["coulomb_positive"] == pytest.approx(0.08, rel=0.1)
+    assert found["coulomb_negative"] == pytest.approx(0.0, abs=0.008)
+    assert found["viscous_positive"] == pytest.approx(DAMPED, rel=0.1)
+    assert found["viscous_negative"] == pytest.approx(DAMPED, rel=0.1)
