@@ -86,3 +86,16 @@ def test_an_own_effect_takes_under_30_lines():
 def test_every_example_is_run_here():
     here = Path(__file__).read_text(encoding="utf-8")
     assert all(f'"{path.name}"' in here for path in EXAMPLES.glob("*.py"))
+
+
+def test_drone(capsys):
+    names = run("09_drone.py")
+    found: Diagnosis = names["diagnosis"]
+    sizes = {(c.effect, c.target): c.parameters for c in found.selected}
+    assert sizes.keys() == {("air_drag", "body/frame"), ("motor_gain", "actuator/thrust")}
+    drag = sizes["air_drag", "body/frame"]["coefficient"]
+    gain = sizes["motor_gain", "actuator/thrust"]["scale"]
+    assert drag.estimate == pytest.approx(names["DRAG"], rel=0.02)
+    assert gain.estimate == pytest.approx(names["LOSS"], rel=0.005)
+    assert (drag.unit, gain.unit) == ("N s²/m²", "1")
+    assert "Missing: " in capsys.readouterr().out
