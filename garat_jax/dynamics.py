@@ -19,9 +19,9 @@ from garat_jax._mjx import mjx
 from garat_jax.effects.base import Effect, ModelView
 from garat_jax.engine import HostModel
 from garat_jax.errors import UserError, unknown_name
-from garat_jax.mjx_model import put_model
+from garat_jax.mjx_model import put_model, with_fields
 from garat_jax.overrides import Override
-from garat_jax.setconst import CONSTANT_INPUTS, set_const
+from garat_jax.setconst import CONSTANT_INPUTS
 
 ENGINES = ("auto", "mjx", "mujoco")
 
@@ -226,6 +226,32 @@ def hold(
     return note(dynamics, held, num_substeps * dynamics.timestep)
 
 
+def lead(
+    dynamics: Dynamics, state: PhysicsState, ctrl: jax.Array, qpos: jax.Array, qvel: jax.Array
+) -> PhysicsState:
+    """Do a `step` in which the mechanism is led along a path, whatever moves it.
+
+    Motors turn against the joints that are led, and sensors note; activations stay.
+
+    Args:
+        dynamics: The physics.
+        state: One simulation's state; of it the memory goes on.
+        ctrl: Command, [nu].
+        qpos: Positions at the start of the substeps, [num_substeps, nq].
+        qvel: Velocities that led there, [num_substeps, nv].
+    """
+    model = view(dynamics)
+
+    def substep(memory, place):
+        now = state._replace(qpos=place[0], qvel=place[1])
+        *_, memory = _act(dynamics, model, now, ctrl, memory)
+        return memory, None
+
+    memory, _ = jax.lax.scan(substep, state.memory, (qpos, qvel))
+    state = state._replace(qpos=qpos[-1], qvel=qvel[-1], memory=memory)
+    return note(dynamics, state, len(qpos) * dynamics.timestep)
+
+
 def steps_at_once(dynamics: Dynamics) -> bool:
     """Say whether one call can take many steps: nothing looks at the state on the way."""
     if dynamics.engine != "mujoco" or dynamics.host.model.na:
@@ -335,14 +361,7 @@ def _constants(dynamics: Dynamics, model: ModelView) -> Any:
     """Return what the engine needs of the changed fields: an MJX model, or the fields."""
     if dynamics.engine == "mujoco":
         return model.changed
-    options = {n[4:]: v for n, v in model.changed.items() if n.startswith("opt.")}
-    fields = {n: v for n, v in model.changed.items() if not n.startswith("opt.")}
-    changed = dynamics.model.replace(**fields)  # pyright: ignore[reportOptionalMemberAccess]
-    if options:
-        changed = changed.replace(opt=changed.opt.replace(**options))
-    if CONSTANT_INPUTS & fields.keys():
-        changed = set_const(changed, dynamics.host.model)
-    return changed
+    return with_fields(dynamics.model, dynamics.host.model, model.changed)  # pyright: ignore[reportArgumentType]
 
 
 def _tuned(dynamics: Dynamics, constants: Any, model: ModelView, tuned: ModelView) -> Any:
@@ -364,23 +383,13 @@ def _advance(
     if dynamics.engine == "mujoco":
         return dynamics.host.advance(constants, state, commands, forces, num_substeps)
     data = mjx.make_data(dynamics.host.model)
+    stepped = [name for name in PhysicsState._fields if name != "memory"]
 
     def substep(state: PhysicsState, inputs):
         ctrl, force = inputs
-        after = mjx.step(
-            constants,
-            data.replace(
-                time=state.time,
-                qpos=state.qpos,
-                qvel=state.qvel,
-                act=state.act,
-                qacc_warmstart=state.qacc_warmstart,
-                ctrl=ctrl,
-                qfrc_applied=force,
-            ),
-        )
-        kept = {name: getattr(after, name) for name in PhysicsState._fields if name != "memory"}
-        return PhysicsState(**kept, memory=state.memory), None
+        before = {name: getattr(state, name) for name in stepped}
+        after = mjx.step(constants, data.replace(**before, ctrl=ctrl, qfrc_applied=force))
+        return state._replace(**{name: getattr(after, name) for name in stepped}), None
 
     repeat = (num_substeps, 1)
     inputs = tuple(jnp.tile(x, repeat) if x.shape[0] == 1 else x for x in (commands, forces))

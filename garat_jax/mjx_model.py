@@ -1,12 +1,14 @@
 """A compiled model as MJX steps it, or one line that says what of it MJX cannot step."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
+import jax
 import mujoco
 import numpy as np
 
 from garat_jax._mjx import mjx
 from garat_jax.errors import UserError
+from garat_jax.setconst import CONSTANT_INPUTS, set_const
 
 HINT = "use engine mujoco, which JAX_PLATFORMS=cpu chooses"
 DELAY_HINT = "take it out of the model, and give the effect actuator_delay or sensor_delay"
@@ -31,6 +33,26 @@ def put_model(model: mujoco.MjModel) -> mjx.Model:
         return mjx.put_model(model)
     except NotImplementedError as error:
         raise UserError(f"engine mjx cannot step this model: {error}; use mujoco") from error
+
+
+def with_fields(
+    model: mjx.Model, host: mujoco.MjModel, changed: Mapping[str, jax.Array]
+) -> mjx.Model:
+    """Return a model for MJX with these native fields, and the constants that follow from them.
+
+    Args:
+        model: The model as `put_model` gives it.
+        host: The compiled MuJoCo model.
+        changed: Fields by name; those of the options begin with `opt.`.
+    """
+    options = {n[4:]: v for n, v in changed.items() if n.startswith("opt.")}
+    fields = {n: v for n, v in changed.items() if not n.startswith("opt.")}
+    model = model.replace(**fields)
+    if options:
+        model = model.replace(opt=model.opt.replace(**options))
+    if CONSTANT_INPUTS & fields.keys():
+        model = set_const(model, host)
+    return model
 
 
 def _ignored(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray, str]]:

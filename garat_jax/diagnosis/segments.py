@@ -52,7 +52,8 @@ class Segments:
         first: Index of the first sample within its recording, [S].
         past: Command of every simulated step of each recording from where it begins, padded,
             [R, T, nu].
-        num_past: How many of these came before the warm-up, [S].
+        past_qvel: Mean measured velocity in each of these steps, 0 in gaps, [R, T, nv].
+        num_past: How many of these steps came before the segment, [S].
         noise: Standard deviation of each signal's noise, [num_signals].
         spread: Standard deviation of each signal, `QUIET` times its noise at least, [num_signals].
         start_unit: What the initial states differ by, a unit of each component, [nq + nv].
@@ -68,6 +69,7 @@ class Segments:
     recording: np.ndarray
     first: np.ndarray
     past: np.ndarray
+    past_qvel: np.ndarray
     num_past: np.ndarray
     noise: np.ndarray
     spread: np.ndarray
@@ -177,7 +179,8 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         recording=index,
         first=np.asarray([a for _, a, _ in pieces]),
         past=_past(recordings, before),
-        num_past=np.asarray([max(before[i][a] - warm_up, 0) for i, a, _ in pieces]),
+        past_qvel=_past_qvel(recordings, before),
+        num_past=np.asarray([before[i][a] for i, a, _ in pieces]),
         noise=deviations,
         spread=np.maximum(spread, QUIET * deviations),
         start_unit=_unit(start),
@@ -276,6 +279,17 @@ def _past(recordings: Sequence[Recording], steps: Sequence[np.ndarray]) -> np.nd
     every = np.arange(max(at[-1] for at in steps))
     held = [np.searchsorted(at, every, side="right") - 1 for at in steps]
     return np.stack([r.ctrl[rows] for r, rows in zip(recordings, held, strict=True)])
+
+
+def _past_qvel(recordings: Sequence[Recording], steps: Sequence[np.ndarray]) -> np.ndarray:
+    """Return every recording's velocity in the middle of the simulated steps, [R, T, nv]."""
+    qvel = np.zeros((len(recordings), max(at[-1] for at in steps), recordings[0].qvel.shape[1]))
+    for row, recording, at in zip(qvel, recordings, steps, strict=True):
+        for a, b in recording.spans:
+            every = np.arange(at[a], at[b - 1])
+            speeds = [np.interp(every + 0.5, at[a:b], v) for v in recording.qvel[a:b].T]
+            row[every] = np.stack(speeds, axis=1)
+    return qvel
 
 
 def _steps(time: np.ndarray, grid: Grid) -> int:

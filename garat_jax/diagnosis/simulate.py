@@ -16,11 +16,15 @@ import numpy as np
 from garat_jax import dynamics
 from garat_jax.compiler_options import OPTIMISATION_LEVEL
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.past import Past, has_memory_of_motion, way_to
 from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
 from garat_jax.dynamics import Override
 from garat_jax.effects import Effect, Parameter
 from garat_jax.errors import UserError
 
+NUM_PROGRAMS = 40
+"""How many programs stay compiled: on a CPU one takes some 250 of a process's 65,530 memory maps,
+and a diagnosis has two simulators, of up to two batch sizes a program."""
 BATCH_SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
 substep, many simulations share its cost. Each size is compiled once."""
@@ -52,15 +56,14 @@ class Program(NamedTuple):
     """A compiled program.
 
     Attributes:
-        run: Takes a batch of (theta, start, ctrl, place), the past commands of all recordings with
-            each one's recording and number of them if an effect remembers, else None, and a path
-            if it looks along one.
-        remembers: Whether an effect remembers.
+        run: Takes a batch of (theta, start, ctrl, place), the `Past` if it looks back, else None,
+            and a path if it looks along one.
+        looks_back: Whether an effect remembers, or has a memory of the motion.
         is_stepped: Whether C MuJoCo is called for every physics substep.
     """
 
     run: Callable
-    remembers: bool
+    looks_back: bool
     is_stepped: bool
 
 
@@ -104,6 +107,7 @@ class Simulator:
         self._alone = self._compile(())
         self._substeps = grid.substeps * refine
         self._warm_up = warm_up_steps(grid, self.host.nu)
+        self._grid = grid
         self._on_grid = grid.uniform
         self.slots = tuple(
             Slot(i, p, float(getattr(effect, p.name)))
@@ -121,7 +125,7 @@ class Simulator:
         self._compiler_options = dict(UNOPTIMISED) if self._alone.engine == "mujoco" else {}
         self._transform = model.transform
         self._any_at_once = dynamics.steps_at_once(self._alone) and model.transform is None
-        self._programs: dict[tuple[str, tuple[int, ...]], Program] = {}
+        self._jitted = functools.lru_cache(NUM_PROGRAMS)(self._jit)
 
     @property
     def host(self):
@@ -238,24 +242,29 @@ class Simulator:
     def _program(self, chosen: tuple[int, ...]) -> Program:
         """Return the compiled program in which these candidates act."""
         if self._any_at_once and {*chosen} <= {*self._blind}:
-            return self._jitted("at once", chosen, self._predict_at_once)
-        return self._jitted("stepped", chosen, self._predict)
+            return self._jitted("at once", chosen)
+        return self._jitted("stepped", chosen)
 
     def _along(self, chosen: tuple[int, ...]) -> Program:
         """Return the compiled program in which these candidates look at a given path."""
-        return self._jitted("along", chosen, self._predict_along)
+        return self._jitted("along", chosen)
 
-    def _jitted(self, way: str, chosen: tuple[int, ...], function) -> Program:
-        if (way, chosen) not in self._programs:
-            world = self._compile(chosen)
-            acting = (*world.effects, *(self.effects[i] for i in chosen))
-            remembers = any(effect.remembers for effect in acting)
-            one = functools.partial(function, world, chosen)
-            past = (None, 0, 0) if remembers else None
-            axes = (0, 0, 0, 0, past, 0)[: 6 if way == "along" else 5]
-            run = jax.jit(jax.vmap(one, axes), compiler_options=self._compiler_options)
-            self._programs[way, chosen] = Program(run, remembers, way == "stepped")
-        return self._programs[way, chosen]
+    def _jit(self, way: str, chosen: tuple[int, ...]) -> Program:
+        """Return a program that is compiled when it first runs."""
+        predict = {
+            "at once": self._predict_at_once,
+            "along": self._predict_along,
+            "stepped": self._predict,
+        }[way]
+        world = self._compile(chosen)
+        acting = (*world.effects, *(self.effects[i] for i in chosen))
+        looks_back = any(effect.remembers for effect in acting)
+        looks_back |= way == "stepped" and has_memory_of_motion(acting, self.host)
+        one = functools.partial(predict, world, chosen)
+        past = Past._make((None, None, 0, 0)) if looks_back else None
+        axes = (0, 0, 0, 0, past, 0)[: 6 if way == "along" else 5]
+        run = jax.jit(jax.vmap(one, axes), compiler_options=self._compiler_options)
+        return Program(run, looks_back, way == "stepped")
 
     def _in_batches(self, program: Program, segments: Segments, theta, start, path=None):
         """Run a program for rows [P] and segments [S]; return signals and paths [P, S, ..].
@@ -275,9 +284,10 @@ class Simulator:
             begin = starts[chosen]
             begin[total - first :] = np.nan  # padding: C MuJoCo leaves it out
             own = theta[row, segment] if theta.ndim > 2 else theta[row]
-            past = (segments.past, segments.recording[segment], segments.num_past[segment])
+            before = (segments.recording[segment], segments.num_past[segment])
+            past = Past(segments.past, segments.past_qvel, *before)
             inputs = (own, begin, segments.ctrl[segment], segments.place[segment])
-            inputs = (*inputs, past if program.remembers else None)
+            inputs = (*inputs, past if program.looks_back else None)
             with jax.enable_x64(True):
                 signals, true = program.run(*inputs, *more)
                 found.append(np.asarray(signals)[..., : segments.measured.shape[2]])
@@ -302,14 +312,13 @@ class Simulator:
     def _begin(self, world: dynamics.Dynamics, start, past):
         num_position = self.host.nq
         state = dynamics.initial_state(world, start[:num_position], start[num_position:])
-        if past is None:
+        if not any(effect.remembers for effect in world.effects):
             return state
-        ctrl, recording, count = past
 
         def remember(k, state):
-            return dynamics.hold(world, state, ctrl[recording, k], self._substeps)
+            return dynamics.hold(world, state, past.ctrl[past.recording, k], self._substeps)
 
-        return jax.lax.fori_loop(0, count, remember, state)
+        return jax.lax.fori_loop(0, past.num_steps - self._warm_up, remember, state)
 
     def _predict_at_once(self, world, chosen: tuple[int, ...], theta, start, ctrl, place, past):
         """Predict one segment with candidates that do not look at the state."""
@@ -335,7 +344,9 @@ class Simulator:
     def _predict(self, world, chosen: tuple[int, ...], theta, start, ctrl, place, past):
         """Predict one segment step by step: what the sensors report, and the path on the grid.
 
-        During the warm-up the mechanism is held at its start.
+        During the warm-up the mechanism is held at its start. Where an effect has a memory of the
+        motion it is then led to the start along the measured motion: motors behind gears that
+        bend swing for longer than a segment.
         """
         world = self._with(world, chosen, theta)
         state = self._begin(world, start, past)
@@ -351,11 +362,18 @@ class Simulator:
         def hold(state, command):
             return dynamics.hold(world, state, commanded(state, command), self._substeps), None
 
+        def lead(state, step):
+            command, *path = step
+            return dynamics.lead(world, state, commanded(state, command), *path), None
+
         def advance(state, command):
             state = dynamics.step(world, state, commanded(state, command), self._substeps)
             return state, (whole(dynamics.sensed(world, state)), whole(state))
 
         state, _ = jax.lax.scan(hold, state, ctrl[: self._warm_up])
+        if has_memory_of_motion(world.effects, self.host):
+            way = way_to(start, past, self.host, self._grid, self._substeps)
+            state, _ = jax.lax.scan(lead, state, way)
         _, paths = jax.lax.scan(advance, state, ctrl[self._warm_up :])
         firsts = (whole(dynamics.sensed(world, state)), whole(state))
         signals, true = (

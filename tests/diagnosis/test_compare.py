@@ -128,6 +128,7 @@ def handmade(predicted, measured, weight) -> Replay:
         recording=np.zeros(len(measured), int),
         first=np.arange(len(measured)) * measured.shape[1],
         past=empty,
+        past_qvel=empty,
         num_past=np.zeros(len(measured), int),
         noise=np.asarray([0.1]),
         spread=np.asarray([2.0]),

@@ -114,6 +114,7 @@ def test_each_condition_is_simulated_with_what_is_shared_and_what_is_its_own():
                 "noise",
                 "spread",
                 "past",
+                "past_qvel",
                 "num_past",
             ),
             many,

@@ -70,8 +70,7 @@ def test_past_commands_are_those_on_the_simulated_steps():
     grid = choose_grid([made, other], 0.002)
     segments = cut([made, other], grid, 0.2)
     late = np.flatnonzero((segments.recording == 0) & (segments.first == 150))[0]
-    warm_up = 25
-    assert segments.num_past[late] == 250 - warm_up
+    assert segments.num_past[late] == 250
     assert segments.num_past[0] == 0
     np.testing.assert_array_equal(segments.past[0, :150], made.ctrl[:150])
     np.testing.assert_array_equal(segments.past[0, 150:250], np.tile(made.ctrl[149], (100, 1)))
