@@ -40,8 +40,9 @@ def judge(
 ) -> Judged:
     """Return every score's candidate, with its contender if it was fitted, best first.
 
-    Of candidates that do much the same, and leave no more than noise and the integrator make, the
-    one with the fewest parameters that passes every gate is the best.
+    Of the one that fits best and those that do much the same, the best that passes every gate comes
+    first: a lag has no evidence beside the delay that does what it does. Where they leave no more
+    than noise and the integrator make, that is the one with the fewest parameters.
 
     Args:
         problem: What is fitted.
@@ -65,9 +66,11 @@ def judge(
         found = {
             i: _judge_one(problem, metric, current, contenders, i, alike, drawn) for i in order
         }
-        near = [i for i in (order[0], *alike[order[0]]) if at_floor[order[0]] and at_floor[i]]
-        passing = [i for i in near if found[i][0].passes]
-        best = min(passing, key=lambda i: len(contenders[i].fit.free), default=order[0])
+        near = {order[0], *alike[order[0]]}
+        passing = [i for i in order if i in near and found[i][0].passes]
+        if at_floor[order[0]]:
+            passing.sort(key=lambda i: (not at_floor[i], len(contenders[i].fit.free)))
+        best = next(iter(passing), order[0])
         judged = [found[best], *(found[i] for i in order if i != best)]
         judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
     fitted = [c.score.effect for c in contenders]

@@ -321,20 +321,24 @@ def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:
 
 
 def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):
-    """Replace the best contender where a refinement of its law certainly explains more.
+    """Replace the best contender, and those that it does not lead, by refinements of their laws.
 
-    Screening prefers the simpler law. A refinement's threshold hides it there; one without waits
-    for the next round, where other effects rival it, if the simpler law proves itself.
+    A refinement comes in a law's place where it certainly explains more. Screening prefers the
+    simpler law. A refinement's threshold hides it there; one without waits for the next round,
+    where other effects rival it, if the simpler law proves itself and has no rival.
     """
     best = _best(contenders)
     if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
         return contenders
+    rivals = _unled(problem, best, contenders)
     proves_itself = held_out_gain(problem, metric, current, best.fit).low > 0
-    names = [c for c in contenders if c.fit.residual is best.fit.residual]
-    for name in names:
-        for refined in fit_refinements(problem, current, name, scores, say, proves_itself):
-            if leads(problem, refined.fit, best.fit):
-                contenders, best = _replaced(contenders, best, refined), refined
+    for rival in rivals:
+        names = [c for c in contenders if c.fit.residual is rival.fit.residual]
+        for name in names:
+            waits = proves_itself and len(rivals) == 1
+            for refined in fit_refinements(problem, current, name, scores, say, waits):
+                if leads(problem, refined.fit, rival.fit):
+                    contenders, rival = _replaced(contenders, rival, refined), refined
     return contenders
 
 
@@ -346,13 +350,18 @@ def _fill_out(problem, metric: Metric, contenders, floor: Floor, say):
     best = _best(contenders)
     if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
         return contenders
-    fits = {id(c.fit.residual): c for c in [*contenders, best]}  # names share one
-    for rival in fits.values():
-        if rival is best or not leads(problem, best.fit, rival.fit):
-            for fuller in fit_further(problem, rival, say):
-                if leads(problem, fuller.fit, rival.fit):
-                    contenders = _replaced(contenders, rival, fuller)
+    for rival in _unled(problem, best, contenders):
+        for fuller in fit_further(problem, rival, say):
+            if leads(problem, fuller.fit, rival.fit):
+                contenders = _replaced(contenders, rival, fuller)
     return contenders
+
+
+def _unled(problem: Problem, best: Contender, contenders: Sequence[Contender]) -> list[Contender]:
+    """Return the best contender and those that it does not lead, each fit under one name."""
+    fits = {id(c.fit.residual): c for c in [*contenders, best]}  # names share one
+    others = (c for c in fits.values() if c is not best)
+    return [best, *(c for c in others if not leads(problem, best.fit, c.fit))]
 
 
 def _best(contenders: Sequence[Contender]) -> Contender | None:
