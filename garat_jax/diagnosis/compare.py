@@ -262,6 +262,7 @@ def _errors(played: Replay, simulator: Simulator, finer: Simulator, grid: Grid) 
         metric.of_noise(~nothing),
         metric="root mean square of prediction error by signal's standard deviation, all "
         f"recordings, segments of {played.horizon:g} s",
+        horizon=played.horizon,
         before=played.error(),
         after=played.error(),
         timestep=grid.timestep,

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.diagnose import UNEXPLAINED, diagnose, split, thin
+from garat_jax.diagnosis.diagnose import diagnose, split, thin
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
@@ -22,7 +22,7 @@ from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, save_card
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Diagnosis
+from garat_jax.diagnosis.results import UNEXPLAINED, Diagnosis
 from garat_jax.diagnosis.segments import Segments, choose_grid
 from garat_jax.diagnosis.simulate import Simulator, Slot
 from garat_jax.diagnosis.timestep import count_timestep

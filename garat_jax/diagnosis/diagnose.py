@@ -5,11 +5,10 @@ import itertools
 import time
 from collections.abc import Callable, Sequence
 
-import mujoco
 import numpy as np
 
-from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.drift import find_drifts
+from garat_jax.diagnosis.held_out import errors_of, longest_errors
 from garat_jax.diagnosis.horizon import (
     choose_horizon,
     cut_longer,
@@ -38,8 +37,6 @@ from garat_jax.provenance import versions
 
 ENOUGH = 250.0
 """Samples a second that a passive mechanism needs."""
-UNEXPLAINED = 0.3
-"""Share of the error that may stay, however near to the noise floor that is."""
 
 
 def diagnose(
@@ -84,7 +81,8 @@ def diagnose(
     problem = trusted(problem, settled)
     outcome = explain(problem, settled.start, say, lambda p, t: cut_longer(p, everything, grid, t))
     problem = outcome.problem
-    error = _errors(problem, outcome, host, how, grid.timestep)
+    error = errors_of(problem, (outcome.before, outcome.after), outcome.floor, host, how)
+    longest = longest_errors(problem, outcome.after.theta, everything, grid, host, how)
     explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
     found = Diagnosis(
         model=str(model.path),
@@ -92,8 +90,9 @@ def diagnose(
         holdout=tuple(r.name for r in held_out),
         versions=versions(),
         seconds=0.0,
-        verdict=_verdict(outcome, error),
+        verdict=_verdict(outcome, error, longest),
         error=error,
+        longest=longest,
         where=tuple(localise(missing_torque(host, everything))),
         candidates=outcome.candidates,
         selected=outcome.selected,
@@ -178,59 +177,11 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
     return tuple(candidates)
 
 
-def metric_in_words(problem: Problem, how: str) -> str:
-    """Say what the reported errors are; `how` names the recordings."""
-    return (
-        "root mean square of prediction error by signal's standard deviation (a signal that hardly "
-        f"moves: by its noise, as a typical other), {how}, segments of {problem.horizon:.2g} s"
-    )
-
-
-def _verdict(outcome: Outcome, error: Errors) -> Verdict:
+def _verdict(outcome: Outcome, error: Errors, longest: Errors | None) -> Verdict:
     if outcome.adequate and not error.is_too_coarse:
-        return "adequate"
-    return "missing_effect" if outcome.selected and is_explained(error) else "unexplained"
-
-
-def is_explained(error: Errors) -> bool:
-    """Say whether what is left is hardly any of the error, or little and near the noise floor."""
-    share = error.unexplained_share
-    return share <= SMALLEST_SHARE or (error.is_near_floor and share <= UNEXPLAINED)
-
-
-def _errors(problem: Problem, outcome: Outcome, host: mujoco.MjModel, how: str, timestep: float):
-    metric, held_out = make_metric(problem), ~problem.fitted
-    segments = problem.segments
-    shape = (-1, *segments.measured.shape[1:])
-    listed = signals(host)
-    per_signal = {}
-    for i in range(shape[-1]):
-        sampled = segments.counts[held_out][..., i] > 0
-        if not sampled.any():
-            continue
-        sizes = [
-            float(np.sqrt(np.mean(residual.reshape(shape)[sampled][:, i] ** 2)))
-            for residual in (
-                outcome.before.residual[held_out] / metric.trust[held_out],
-                outcome.after.residual[held_out] / metric.trust[held_out],
-            )
-        ]
-        noise = float(segments.noise[i])
-        per_signal[listed[i].name] = {
-            "before": sizes[0] * noise,
-            "after": sizes[1] * noise,
-            "noise_floor": noise,
-            "unit": listed[i].unit,
-        }
-    return Errors.above(
-        outcome.floor,
-        metric.of_noise(held_out),
-        metric=metric_in_words(problem, how),
-        before=metric.error(outcome.before.residual, held_out),
-        after=metric.error(outcome.after.residual, held_out),
-        timestep=timestep,
-        per_signal=per_signal,
-    )
+        return "adequate" if longest is None or longest.is_near_floor else "unexplained"
+    explained = outcome.selected and all(e.is_explained for e in (error, longest) if e)
+    return "missing_effect" if explained else "unexplained"
 
 
 def _ladder(problem: Problem, outcome: Outcome) -> tuple[Rung, ...]:

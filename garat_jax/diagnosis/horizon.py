@@ -1,7 +1,7 @@
 """How long a segment may last: as long as the model can be followed."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -121,6 +121,28 @@ def cut_longer(
     Returns:
         The problem of longer segments and a fit of their initial states, or None.
     """
+    for longer in _predictable(problem, recordings, grid, theta):
+        settled = settle(longer, theta, longer.segments.start)
+        error = _error(longer.unwhiten(settled.residual), longer.segments)
+        if _is_within(error.max(axis=1)):
+            return longer, settled
+    return None
+
+
+def cut_longest(
+    problem: AnyProblem, recordings: Sequence[Recording], grid: Grid, theta: np.ndarray
+) -> AnyProblem | None:
+    """Cut as `cut_longer`, however much the model errs; None where no longer segments do.
+
+    Over these a small change of the initial state hardly grows: the error there is the model's.
+    """
+    return next(_predictable(problem, recordings, grid, theta), None)
+
+
+def _predictable(
+    problem: AnyProblem, recordings: Sequence[Recording], grid: Grid, theta: np.ndarray
+) -> Iterator[AnyProblem]:
+    """Yield the problems of longer segments over which perturbations do not grow, longest first."""
     fitted = np.unique(problem.segments.recording[problem.fitted])
     for horizon in _possible(recordings):
         segments = cut(recordings, grid, horizon)
@@ -129,11 +151,7 @@ def cut_longer(
         growth = _growth(_perturbed(problem.simulator, theta, segments), segments)
         if _is_within(growth.max(axis=1)):
             seen = np.isin(segments.recording, fitted)
-            longer = dataclasses.replace(problem, segments=segments, fitted=seen)
-            settled = settle(longer, theta, segments.start)
-            if _is_within(_error(longer.unwhiten(settled.residual), segments).max(axis=1)):
-                return longer, settled
-    return None
+            yield dataclasses.replace(problem, segments=segments, fitted=seen)
 
 
 def _possible(recordings: Sequence[Recording]) -> list[float]:

@@ -12,9 +12,10 @@ import plotly.graph_objects as go
 from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.conditions import add_conditions, read_conditions, write_cards
-from garat_jax.diagnosis.diagnose import diagnose, is_explained, metric_in_words, split, thin
+from garat_jax.diagnosis.diagnose import diagnose, split, thin
 from garat_jax.diagnosis.export import copy_model, needed_files
 from garat_jax.diagnosis.findings import Candidate
+from garat_jax.diagnosis.held_out import errors_of, longest_errors
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric, noise_floor
@@ -24,7 +25,7 @@ from garat_jax.diagnosis.progress import progress
 from garat_jax.diagnosis.repeat import found_theta, nominal_effects, repeatability
 from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosis_sections
 from garat_jax.diagnosis.report_conditions import condition_sections
-from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
+from garat_jax.diagnosis.results import Diagnosis, Rung, Verdict
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -133,21 +134,15 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     first, last = rounds[0], rounds[-1]
     if not added:
         return first
-    ladder, per_signal, floor, metric = _ladder(model, recordings, holdout, added)
-    error = Errors.above(
-        *floor,
-        metric=metric,
-        before=ladder[0].error_holdout,
-        after=ladder[-1].error_holdout,
-        timestep=first.error.timestep,
-        per_signal=_with_after(first.error, per_signal),
-    )
-    stays = last.verdict == "unexplained" and not is_explained(error)
+    ladder, error, longest = _ladder(model, recordings, holdout, added)
+    stays = not all(e.is_explained for e in (error, longest) if e)
+    stays = stays and last.verdict == "unexplained"
     verdict: Verdict = "unexplained" if stays else "missing_effect"
     return dataclasses.replace(
         first,
         verdict=verdict,
         error=error,
+        longest=longest,
         selected=added,
         ladder=ladder,
         left=last.left if stays else (),
@@ -159,8 +154,8 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     """Return what the errors of all effects together are, measured at one horizon.
 
     Returns:
-        A rung for each effect, at its final size; each signal's error by their number; the noise
-        floor with all of them, and what noise alone makes of it; and what the errors are, in words.
+        A rung for each effect, at its final size; the errors at this horizon, and those over the
+        longest segments, as `longest_errors` has them.
     """
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
@@ -183,16 +178,9 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
         Rung(candidate, metric.error(f.residual, seen), metric.error(f.residual, ~seen))
         for candidate, f in zip((None, *added), fits, strict=True)
     )
-    by_signal = [metric.by_signal(f.residual, ~seen) * segments.noise for f in fits]
-    floor = noise_floor(problem, metric, fits[-1]).error
-    return rungs, by_signal, (floor, metric.of_noise(~seen)), metric_in_words(problem, how)
-
-
-def _with_after(error: Errors, by_signal: Sequence[np.ndarray]) -> Mapping[str, Mapping[str, Any]]:
-    return {
-        name: {**row, "before": float(by_signal[0][i]), "after": float(by_signal[-1][i])}
-        for i, (name, row) in enumerate(error.per_signal.items())
-    }
+    host, floor = simulator.host, noise_floor(problem, metric, fits[-1]).error
+    error = errors_of(problem, (fits[0], fits[-1]), floor, host, how)
+    return rungs, error, longest_errors(problem, final, everything, grid, host, how)
 
 
 def run_improve(

@@ -73,7 +73,7 @@ def _with_warnings(lead: str, warnings: Sequence[str]) -> str:
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
-    error = diagnosis.error
+    error, over = diagnosis.decisive, diagnosis.over
     if error.is_too_coarse:
         return error.coarseness
     names = " and ".join(_label_with_alike(c) for c in diagnosis.selected)
@@ -84,12 +84,12 @@ def _verdict(diagnosis: Diagnosis) -> str:
             f"{_percent(error.before)} of the signals' spread, and {floor}{diagnosis.blindness}."
         )
     fall = (
-        f"the error on recordings held out falls from {_percent(error.before)} to "
+        f"the error on recordings held out{over} falls from {_percent(error.before)} to "
         f"{_percent(error.after)} of the signals' spread; {floor}"
     )
     if diagnosis.verdict == "missing_effect":
         return f"The model lacks {names}. With it, {fall}."
-    rest = f"{_percent(error.unexplained_share)} of the error stays unexplained"
+    rest = f"{_percent(error.unexplained_share)} of the error{over} stays unexplained"
     if names:
         return f"The model lacks {names}, but that is not all. With it, {fall}: {rest}."
     return f"Something is missing that no effect in the catalogue explains: {rest}."
@@ -106,10 +106,10 @@ def _label_with_alike(candidate: Candidate) -> str:
 
 def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     """Return the numbers of a diagnosis to be seen first."""
-    error = diagnosis.error
+    error, over = diagnosis.decisive, diagnosis.over
     return [
-        Fact(_percent(error.before), "error of the model as it is, of each signal's spread"),
-        Fact(_percent(error.after), "error with the effects that were found"),
+        Fact(_percent(error.before), f"error of the model as it is{over}, of each signal's spread"),
+        Fact(_percent(error.after), f"error{over} with the effects that were found"),
         Fact(_percent(error.noise_floor), "noise floor: what noise alone would make"),
         Fact(_percent(error.unexplained_share), "of the error stays unexplained"),
     ]

@@ -17,6 +17,7 @@ from garat_jax.diagnosis.findings import (
     Unseen,
     list_unseen,
 )
+from garat_jax.diagnosis.judge import SMALLEST_SHARE
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.metric import ABOVE_FLOOR
 from garat_jax.errors import choose
@@ -31,6 +32,8 @@ OFFER = (
 TOO_COARSE = 1.0 / ABOVE_FLOOR
 """Integrator's error, relative to the signals' spread, above which a model that is as bad as always
 predicting the mean would be near the floor."""
+UNEXPLAINED = 0.3
+"""Share of the error that may stay, however near to the noise floor that is."""
 Verdict = Literal["adequate", "missing_effect", "unexplained"]
 
 
@@ -57,6 +60,7 @@ class Errors:
         per_signal: By signal: before, after, noise_floor and the signal's unit, in that unit.
         timestep: Seconds of a step of the physics.
         integrator: What the integrator's error alone makes at this timestep.
+        horizon: Seconds of the segments that are predicted.
     """
 
     metric: str
@@ -68,6 +72,7 @@ class Errors:
     per_signal: Mapping[str, Mapping[str, float | str]]
     timestep: float = math.nan
     integrator: float = 0.0
+    horizon: float = math.nan
 
     @classmethod
     def above(
@@ -76,6 +81,7 @@ class Errors:
         of_noise: float,
         *,
         metric: str,
+        horizon: float,
         before: float,
         after: float,
         timestep: float,
@@ -86,7 +92,8 @@ class Errors:
         rest = math.sqrt(max(after**2 - floor**2, 0.0))
         share = rest / before if before > 0 else 0.0
         share = 1.0 if integrator > TOO_COARSE else share
-        return cls(metric, "1", before, after, floor, share, per_signal, timestep, integrator)
+        known = (before, after, floor, share, per_signal, timestep, integrator, horizon)
+        return cls(metric, "1", *known)
 
     @property
     def is_too_coarse(self) -> bool:
@@ -97,6 +104,12 @@ class Errors:
     def is_near_floor(self) -> bool:
         """Whether what is left is what noise, and an integrator that can be trusted, make."""
         return self.after <= ABOVE_FLOOR * self.noise_floor and not self.is_too_coarse
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether what is left is hardly any of the error, or little and near the noise floor."""
+        share = self.unexplained_share
+        return share <= SMALLEST_SHARE or (self.is_near_floor and share <= UNEXPLAINED)
 
     @property
     def coarseness(self) -> str:
@@ -124,6 +137,9 @@ class Diagnosis:
     has the effects that were selected here; one of the same kind and place replaces it there. The
     parameters of `selected` then fit all conditions together, save those in which most of the gap
     stays; errors and candidates are of each condition by itself.
+
+    `longest` holds the errors over longer segments than those that were fitted, the longest within
+    which small changes do not grow; None where those fitted are as long.
     """
 
     model: str
@@ -145,6 +161,7 @@ class Diagnosis:
     still: bool = False
     left: tuple[Place, ...] = ()
     conditions: Mapping[str, "Diagnosis"] = dataclasses.field(default_factory=dict)
+    longest: Errors | None = None
 
     def added(self, rung: Rung) -> str:
         """Say what a rung of the ladder adds, at its final size."""
@@ -186,10 +203,10 @@ class Diagnosis:
     @property
     def sentence(self) -> str:
         """What is wrong, in one sentence."""
-        error = self.error
+        error, over = self.decisive, self.over
         if error.is_too_coarse:
             return error.coarseness
-        fall = f"held-out error {error.before:.3g} → {error.after:.3g}"
+        fall = f"held-out error{over} {error.before:.3g} → {error.after:.3g}"
         floor = f"{error.noise_floor:.3g}"
         if self.verdict == "adequate":
             return (
@@ -199,15 +216,29 @@ class Diagnosis:
         names = " and ".join(str(c.named) for c in self.selected)
         if self.verdict == "missing_effect":
             return f"Missing: {names} ({fall}, noise floor {floor})."
-        share = f"{100 * error.unexplained_share:.0f} % of the error"
+        share = f"{100 * error.unexplained_share:.0f} % of the error{over}"
         if names:
             return f"Found {names} ({fall}, noise floor {floor}), but {share} stays unexplained."
         return f"Nothing in the catalogue explains the error: {share} stays unexplained."
 
     @property
+    def decisive(self) -> Errors:
+        """The errors that decide: those over the longest segments, where these alone show a gap."""
+        error = self.error
+        seems_right = error.is_explained if self.selected else error.is_near_floor
+        shows = self.verdict == "unexplained" and seems_right
+        return self.longest if self.longest and shows else error
+
+    @property
+    def over(self) -> str:
+        """Over how long segments the decisive errors are, where these are not those fitted."""
+        error = self.decisive
+        return "" if error is self.error else f" over {error.horizon:.2g} s"
+
+    @property
     def is_left(self) -> bool:
         """Whether a gap stays that is the model's, not the integrator's."""
-        return self.verdict == "unexplained" and not self.error.is_too_coarse
+        return self.verdict == "unexplained" and not self.decisive.is_too_coarse
 
     @property
     def left_lines(self) -> list[str]:

@@ -10,7 +10,6 @@ import pytest
 
 from garat_jax.diagnosis import Recording, diagnose, load_model
 from garat_jax.diagnosis.convert import free_pendulum
-from garat_jax.diagnosis.diagnose import is_explained
 from garat_jax.diagnosis.hidden import DRAWN, OUTSIDE, make_recordings
 from garat_jax.diagnosis.results import Errors
 from garat_jax.runs import RunDirectory
@@ -81,7 +80,7 @@ def test_an_effect_outside_the_catalogue_is_unexplained_and_the_result_is_plain(
 def test_a_gap_is_explained_if_little_is_left_and_that_near_the_floor(
     after, floor, share, explained
 ):
-    assert is_explained(Errors("", "1", 1.0, after, floor, share, {})) is explained
+    assert Errors("", "1", 1.0, after, floor, share, {}).is_explained is explained
 
 
 @pytest.mark.slow

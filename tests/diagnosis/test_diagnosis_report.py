@@ -12,7 +12,12 @@ from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.report import diagnosis_lead, diagnosis_sections, write_diagnosis
+from garat_jax.diagnosis.report import (
+    diagnosis_facts,
+    diagnosis_lead,
+    diagnosis_sections,
+    write_diagnosis,
+)
 from garat_jax.diagnosis.results import Errors, Experiment, Rung
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
@@ -80,6 +85,12 @@ ADEQUATE = dataclasses.replace(
 )
 
 
+LONGEST = dataclasses.replace(
+    MISSING.error, before=0.9, after=0.09, unexplained_share=0.1, horizon=2.0
+)
+NOT_ALL = dataclasses.replace(MISSING, verdict="unexplained", longest=LONGEST)
+
+
 def write(tmp_path, diagnosis) -> str:
     """The page without scripts."""
     path = tmp_path / "pendulum.xml"
@@ -95,6 +106,18 @@ def write(tmp_path, diagnosis) -> str:
         run, diagnosis, model.name, diagnosis_sections(diagnosis, model, fit, holdout)
     ).read_text(encoding="utf-8")
     return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_a_gap_that_shows_over_long_segments_alone_is_said_with_their_length():
+    assert NOT_ALL.sentence == (
+        "Found coulomb_friction at joint/hinge (held-out error over 2 s 0.9 → 0.09, noise floor "
+        "0.01), but 10 % of the error over 2 s stays unexplained."
+    )
+    assert diagnosis_lead(NOT_ALL).endswith(": 10 % of the error over 2 s stays unexplained.")
+    assert [fact.value for fact in diagnosis_facts(NOT_ALL)] == ["90 %", "9 %", "1 %", "10 %"]
+    missing = dataclasses.replace(MISSING, longest=LONGEST)
+    assert missing.decisive is missing.error
+    assert NOT_ALL.to_json()["longest"]["horizon"] == 2.0
 
 
 def test_page_of_a_missing_effect_has_every_part(tmp_path):

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis.diagnose import diagnose
-from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
+from garat_jax.diagnosis.held_out import longest_errors
+from garat_jax.diagnosis.horizon import choose_horizon, cut_longer, cut_longest
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -45,6 +47,28 @@ def test_what_was_found_lets_a_model_be_followed_for_longer():
     without = settle(longer, simulator.base, settled.start)
     assert settled.cost.sum() < 0.1 * without.cost.sum()
     assert cut_longer(longer, recordings, grid, np.asarray([GAIN])) is None
+
+
+def test_a_gap_that_shows_in_long_segments_alone_is_measured_there():
+    recordings = record_weak(0.0)
+    grid = choose_grid(recordings, 0.002)
+    simulator, finer = (Simulator(MODEL, (MotorGain("actuator/motor"),), grid, r) for r in (1, 2))
+    horizon, segments = choose_horizon(simulator, recordings, grid)
+    problem = Problem(simulator, finer, segments, segments.recording < 3, 0.004)
+
+    def errors(gain: float) -> Errors | None:
+        theta = np.asarray([gain])
+        return longest_errors(problem, theta, recordings, grid, simulator.host, "held out")
+
+    right, wrong = errors(GAIN), errors(1.2 * GAIN)
+    assert right and wrong
+    assert right.horizon == pytest.approx(wrong.horizon)
+    assert right.horizon > horizon
+    assert right.is_explained and right.is_near_floor
+    assert not wrong.is_explained
+    assert wrong.before == pytest.approx(right.before, rel=1e-3)
+    longest = cut_longest(problem, recordings, grid, simulator.base)
+    assert longest and cut_longest(longest, recordings, grid, simulator.base) is None
 
 
 def test_segments_are_no_longer_than_the_recordings():

@@ -69,3 +69,12 @@ def test_a_simpler_law_that_fails_a_gate_does_not_count(problem):
     first, second = judged(problem, 0.7, 0.8, p_value=0.5)
     assert (first.effect, second.effect) == (RICH, SIMPLE)
     assert first.passes and not second.passes
+
+
+def test_an_equal_of_the_best_that_passes_every_gate_comes_first(problem):
+    best, equal = judged(problem, 1.75, 2.0)
+    assert (best.effect, equal.effect) == (SIMPLE, RICH)
+    assert [named.effect for named in best.indistinguishable_from] == [RICH]
+    first, second = judged(problem, 1.75, 2.0, p_value=0.5)
+    assert (first.effect, second.effect) == (RICH, SIMPLE)
+    assert first.passes and not second.passes

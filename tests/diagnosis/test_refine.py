@@ -10,8 +10,9 @@ from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.findings import Candidate, Interval
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.metric import make_metric, noise_floor
-from garat_jax.diagnosis.rank import _select
+from garat_jax.diagnosis.rank import _select, _unled
 from garat_jax.diagnosis.screen import Score
+from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.steps import Step
 from garat_jax.effects import CATALOGUE, AsymmetricFriction, CoulombFriction
 from tests import models
@@ -112,3 +113,19 @@ def test_a_law_found_before_gives_way_to_its_refinement():
     assert coulomb not in selected.fit.free
     assert selected.fit.theta[positive] == pytest.approx(0.08, rel=0.1)
     assert selected.fit.theta[negative] == pytest.approx(0.12, rel=0.1)
+
+
+def test_rivals_are_the_best_and_those_that_it_does_not_lead_once_each():
+    problem = make_problem([record(lambda spec: None, seed) for seed in range(2)], [])
+    settled = settle(problem, problem.simulator.base, problem.segments.start)
+    score = Score(0, (), (), {}, 0.5, 0.0, True, np.zeros(0))
+
+    def leaves(times: float) -> Contender:
+        return Contender(score, dataclasses.replace(settled, residual=times * settled.residual))
+
+    best, near, far = leaves(1.0), leaves(1.01), leaves(2.0)
+    twin = dataclasses.replace(near, score=dataclasses.replace(score, effect=1))
+    rivals = _unled(problem, best, [far, near, twin, best])
+    assert len(rivals) == 2
+    assert rivals[0] is best
+    assert rivals[1].fit is near.fit

@@ -1,0 +1,103 @@
+"""The errors on held-out recordings that are reported."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from garat_jax.diagnosis.columns import signals
+from garat_jax.diagnosis.horizon import cut_longest
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.metric import make_metric, noise_floor, trusted
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.results import Errors
+from garat_jax.diagnosis.segments import Grid
+from garat_jax.diagnosis.starts import Fit, settle
+
+
+def errors_of(
+    problem: Problem, fits: tuple[Fit, Fit], floor: float, host: mujoco.MjModel, how: str
+) -> Errors:
+    """Return the held-out errors of the model as it is and with what was found.
+
+    Args:
+        problem: The recordings, cut.
+        fits: The two, initial states settled.
+        floor: What noise and the integrator's error make; see `metric.noise_floor`.
+        host: The compiled model.
+        how: Names the recordings that are held out.
+    """
+    metric, held_out = make_metric(problem), ~problem.fitted
+    segments = problem.segments
+    shape = (-1, *segments.measured.shape[1:])
+    listed = signals(host)
+    per_signal = {}
+    for i in range(shape[-1]):
+        sampled = segments.counts[held_out][..., i] > 0
+        if not sampled.any():
+            continue
+        before, after = (
+            float(np.sqrt(np.mean(residual.reshape(shape)[sampled][:, i] ** 2)))
+            for residual in (fit.residual[held_out] / metric.trust[held_out] for fit in fits)
+        )
+        noise = float(segments.noise[i])
+        per_signal[listed[i].name] = {
+            "before": before * noise,
+            "after": after * noise,
+            "noise_floor": noise,
+            "unit": listed[i].unit,
+        }
+    before, after = (metric.error(fit.residual, held_out) for fit in fits)
+    return Errors.above(
+        floor,
+        metric.of_noise(held_out),
+        metric=metric_in_words(problem, how),
+        horizon=problem.horizon,
+        before=before,
+        after=after,
+        timestep=problem.simulator.host.opt.timestep,
+        per_signal=per_signal,
+    )
+
+
+def longest_errors(
+    problem: Problem,
+    theta: np.ndarray,
+    recordings: Sequence[Recording],
+    grid: Grid,
+    host: mujoco.MjModel,
+    how: str,
+) -> Errors | None:
+    """Return the errors over the longest segments within which small changes do not grow.
+
+    Fits need short segments where the model errs much in longer ones. What stays unexplained may
+    show in those alone: a small steady force that is missing grows with time, noise does not.
+
+    Args:
+        problem: The recordings, cut as they were fitted.
+        theta: Parameters with what was found, [num_parameters].
+        recordings: What was measured.
+        grid: The simulated steps.
+        host: The compiled model.
+        how: Names the recordings that are held out.
+
+    Returns:
+        None where segments of `problem` are as long.
+    """
+    longer = cut_longest(problem, recordings, grid, theta)
+    if longer is None:
+        return None
+    after = settle(longer, theta, longer.segments.start)
+    longer = trusted(longer, after)
+    after = settle(longer, theta, after.start)
+    before = settle(longer, longer.simulator.base, longer.segments.start)
+    floor = noise_floor(longer, make_metric(longer), after)
+    return errors_of(longer, (before, after), floor.error, host, how)
+
+
+def metric_in_words(problem: Problem, how: str) -> str:
+    """Say what the reported errors are; `how` names the recordings."""
+    return (
+        "root mean square of prediction error by signal's standard deviation (a signal that hardly "
+        f"moves: by its noise, as a typical other), {how}, segments of {problem.horizon:.2g} s"
+    )
