@@ -15,8 +15,6 @@ from garat_jax.diagnosis.contend import (
     Contender,
     complete,
     fit_contenders,
-    fit_further,
-    fit_refinements,
     is_predicted,
     renamed,
     stands_for,
@@ -43,6 +41,7 @@ from garat_jax.diagnosis.metric import (
     trusted,
 )
 from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.rivals import fill_out, refine
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.steps import Step, prune, refitted, swap
@@ -256,8 +255,8 @@ def _round(
     scores = screen(problem, current, held)
     contenders = fit_contenders(problem, current, refinable, scores, say) if gap else []
     contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
-    contenders = _refine(problem, metric, current, scores, contenders, floor, say)
-    contenders = _fill_out(problem, metric, contenders, floor, say)
+    contenders = refine(problem, metric, current, scores, contenders, floor, say)
+    contenders = fill_out(problem, metric, contenders, floor, say)
     contenders = with_twins(problem, current, scores, contenders, say)
     num_tests = len([score for score in scores if not score.excluded])
     contenders = with_evidence(problem, current, contenders, num_tests)
@@ -318,62 +317,6 @@ def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:
     for contender in added:
         last = complete(problem, dataclasses.replace(last, score=contender.score), say)
     return last
-
-
-def _refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):
-    """Replace the best contender, and those that it does not lead, by refinements of their laws.
-
-    A refinement comes in a law's place where it certainly explains more. Screening prefers the
-    simpler law. A refinement's threshold hides it there; one without waits for the next round,
-    where other effects rival it, if the simpler law proves itself and has no rival.
-    """
-    best = _best(contenders)
-    if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
-        return contenders
-    rivals = _unled(problem, best, contenders)
-    proves_itself = held_out_gain(problem, metric, current, best.fit).low > 0
-    for rival in rivals:
-        names = [c for c in contenders if c.fit.residual is rival.fit.residual]
-        for name in names:
-            waits = proves_itself and len(rivals) == 1
-            for refined in fit_refinements(problem, current, name, scores, say, waits):
-                if leads(problem, refined.fit, rival.fit):
-                    contenders, rival = _replaced(contenders, rival, refined), refined
-    return contenders
-
-
-def _fill_out(problem, metric: Metric, contenders, floor: Floor, say):
-    """Replace the best contender, and those that it does not lead, where more of their laws does.
-
-    Of two that explain the same, one may be the truth without a part that screening left out.
-    """
-    best = _best(contenders)
-    if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
-        return contenders
-    for rival in _unled(problem, best, contenders):
-        for fuller in fit_further(problem, rival, say):
-            if leads(problem, fuller.fit, rival.fit):
-                contenders = _replaced(contenders, rival, fuller)
-    return contenders
-
-
-def _unled(problem: Problem, best: Contender, contenders: Sequence[Contender]) -> list[Contender]:
-    """Return the best contender and those that it does not lead, each fit under one name."""
-    fits = {id(c.fit.residual): c for c in [*contenders, best]}  # names share one
-    others = (c for c in fits.values() if c is not best)
-    return [best, *(c for c in others if not leads(problem, best.fit, c.fit))]
-
-
-def _best(contenders: Sequence[Contender]) -> Contender | None:
-    """Return the contender that fits best, if there is any."""
-    return min(contenders, key=lambda contender: contender.fit.cost.sum(), default=None)
-
-
-def _replaced(contenders: Sequence[Contender], old: Contender, new: Contender) -> list[Contender]:
-    """Put one contender in another's place; the other's names go, as the new one has its own."""
-    names = (c.score.effect for c in contenders if c.fit.residual is old.fit.residual)
-    replaced = {new.score.effect, *names}
-    return [new, *(c for c in contenders if c.score.effect not in replaced)]
 
 
 def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:

@@ -10,7 +10,8 @@ from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.findings import Candidate, Interval
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.metric import make_metric, noise_floor
-from garat_jax.diagnosis.rank import _select, _unled
+from garat_jax.diagnosis.rank import _select
+from garat_jax.diagnosis.rivals import unled
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.steps import Step
@@ -125,7 +126,7 @@ def test_rivals_are_the_best_and_those_that_it_does_not_lead_once_each():
 
     best, near, far = leaves(1.0), leaves(1.01), leaves(2.0)
     twin = dataclasses.replace(near, score=dataclasses.replace(score, effect=1))
-    rivals = _unled(problem, best, [far, near, twin, best])
+    rivals = unled(problem, best, [far, near, twin, best])
     assert len(rivals) == 2
     assert rivals[0] is best
     assert rivals[1].fit is near.fit
