@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis import rank
+from garat_jax.diagnosis import rivals
 from garat_jax.diagnosis.contend import fit_contenders, with_twins
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.screen import screen
@@ -53,10 +53,10 @@ def test_the_names_of_a_fit_go_where_more_of_its_law_explains_more(monkeypatch):
     fuller = dataclasses.replace(
         one, fit=dataclasses.replace(one.fit, residual=one.fit.residual / 2)
     )
-    monkeypatch.setattr(rank, "is_above", lambda *_: True)
-    monkeypatch.setattr(rank, "fit_further", lambda *_: [fuller])
-    monkeypatch.setattr(rank, "leads", lambda *_: True)
-    (kept,) = rank._fill_out(None, None, [one, other], None, print)
+    monkeypatch.setattr(rivals, "is_above", lambda *_: True)
+    monkeypatch.setattr(rivals, "fit_further", lambda *_: [fuller])
+    monkeypatch.setattr(rivals, "leads", lambda *_: True)
+    (kept,) = rivals.fill_out(None, None, [one, other], None, print)
     assert kept is fuller
 
 
@@ -77,9 +77,9 @@ def test_more_of_a_law_is_tried_of_all_that_fit_as_well(monkeypatch):
         tried.append(contender)
         return [fuller] if contender is as_good else []
 
-    monkeypatch.setattr(rank, "is_above", lambda *_: True)
-    monkeypatch.setattr(rank, "fit_further", fit_further)
-    monkeypatch.setattr(rank, "leads", lambda _, a, b: a.cost.sum() < 0.9 * b.cost.sum())
-    kept = rank._fill_out(None, None, [best, as_good, worse], None, print)
+    monkeypatch.setattr(rivals, "is_above", lambda *_: True)
+    monkeypatch.setattr(rivals, "fit_further", fit_further)
+    monkeypatch.setattr(rivals, "leads", lambda _, a, b: a.cost.sum() < 0.9 * b.cost.sum())
+    kept = rivals.fill_out(None, None, [best, as_good, worse], None, print)
     assert [id(c) for c in tried] == [id(best), id(as_good)]
     assert [id(c) for c in kept] == [id(fuller), id(best), id(worse)]
