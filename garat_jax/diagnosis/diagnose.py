@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from garat_jax.diagnosis.drift import find_drifts
-from garat_jax.diagnosis.held_out import errors_of, longest_errors
+from garat_jax.diagnosis.held_out import are_explained, errors_of, longest_errors
 from garat_jax.diagnosis.horizon import (
     choose_horizon,
     cut_longer,
@@ -180,7 +180,7 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
 def _verdict(outcome: Outcome, error: Errors, longest: Errors | None) -> Verdict:
     if outcome.adequate and not error.is_too_coarse:
         return "adequate" if longest is None or longest.is_near_floor else "unexplained"
-    explained = outcome.selected and all(e.is_explained for e in (error, longest) if e)
+    explained = outcome.selected and are_explained(error, longest)
     return "missing_effect" if explained else "unexplained"
 
 

@@ -95,6 +95,11 @@ def longest_errors(
     return errors_of(longer, (before, after), floor.error, host, how)
 
 
+def are_explained(error: Errors, longest: Errors | None) -> bool:
+    """Return whether what was found explains the errors, over the longest segments too."""
+    return error.is_explained and (longest is None or longest.is_explained)
+
+
 def metric_in_words(problem: Problem, how: str) -> str:
     """Say what the reported errors are; `how` names the recordings."""
     return (

@@ -15,7 +15,7 @@ from garat_jax.diagnosis.conditions import add_conditions, read_conditions, writ
 from garat_jax.diagnosis.diagnose import diagnose, split, thin
 from garat_jax.diagnosis.export import copy_model, needed_files
 from garat_jax.diagnosis.findings import Candidate
-from garat_jax.diagnosis.held_out import errors_of, longest_errors
+from garat_jax.diagnosis.held_out import are_explained, errors_of, longest_errors
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric, noise_floor
@@ -135,8 +135,7 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     if not added:
         return first
     ladder, error, longest = _ladder(model, recordings, holdout, added)
-    stays = not all(e.is_explained for e in (error, longest) if e)
-    stays = stays and last.verdict == "unexplained"
+    stays = last.verdict == "unexplained" and not are_explained(error, longest)
     verdict: Verdict = "unexplained" if stays else "missing_effect"
     return dataclasses.replace(
         first,

@@ -224,10 +224,14 @@ class Diagnosis:
     @property
     def decisive(self) -> Errors:
         """The errors that decide: those over the longest segments, where these alone show a gap."""
-        error = self.error
-        seems_right = error.is_explained if self.selected else error.is_near_floor
-        shows = self.verdict == "unexplained" and seems_right
-        return self.longest if self.longest and shows else error
+        error, longest = self.error, self.longest
+        if longest is None or self.verdict != "unexplained":
+            return error
+        return longest if self._is_right(error) and not self._is_right(longest) else error
+
+    def _is_right(self, error: Errors) -> bool:
+        """Whether errors alone would say that nothing, or nothing more, is missing."""
+        return error.is_explained if self.selected else error.is_near_floor
 
     @property
     def over(self) -> str:

@@ -120,6 +120,13 @@ def test_a_gap_that_shows_over_long_segments_alone_is_said_with_their_length():
     assert NOT_ALL.to_json()["longest"]["horizon"] == 2.0
 
 
+def test_long_segments_that_show_no_gap_do_not_decide():
+    right = dataclasses.replace(LONGEST, unexplained_share=0.01)
+    not_all = dataclasses.replace(NOT_ALL, longest=right)
+    assert not_all.decisive is not_all.error
+    assert not_all.over == ""
+
+
 def test_page_of_a_missing_effect_has_every_part(tmp_path):
     page = write(tmp_path, MISSING)
     for heading in (
