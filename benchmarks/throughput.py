@@ -14,7 +14,7 @@ import jax
 import tyro
 from record import RESULTS, command_line, write_result
 from speed import ours
-from speed.ours import Size
+from speed.ours import FIFTH, Size
 from speed.parts import parts
 from speed.sides import RANDOM, Side, measure, with_ratios
 
@@ -52,7 +52,8 @@ def own_sides(name: str, world: World, mjx: World | None) -> list[Side]:
         size = Size(num_seeds, num_envs, num_steps, ITERATIONS)
         if world.params.engine == "mujoco":
             sides.append(ours.engine_alone(name, world, size))
-        sides += [ours.make_side(agent, name, world, size) for agent in (RANDOM, "trpo", "ppo")]
+        agents = (RANDOM, "trpo", "ppo", *((FIFTH,) if num_seeds == 1 else ()))
+        sides += [ours.make_side(agent, name, world, size) for agent in agents]
     if mjx is not None and world.params.engine != "mjx":
         size = Size(1, 50, 20, ITERATIONS)  # MJX on a CPU is slow, and gets less
         sides += [ours.make_side(agent, name, mjx, size) for agent in (RANDOM, "trpo", "ppo")]

@@ -13,7 +13,11 @@ WORLDS = {
     "minitaur": "Minitaur",
 }
 """Names of environments, in the order of the columns."""
-ALGORITHMS = {"trpo": "TRPO", "ppo": "PPO"}
+ALGORITHMS = {
+    "trpo": "TRPO",
+    "ppo": "PPO",
+    "trpo, Fisher from a fifth": "TRPO, Fisher from a fifth",
+}
 PARTS = {
     "rollout": "rollout",
     "advantages": "advantages",

@@ -19,6 +19,9 @@ from garat_jax.types import Agent
 
 from .sides import ENGINE_ALONE, RANDOM, Side
 
+FIFTH = "trpo, Fisher from a fifth"
+"""Our TRPO with the Fisher information estimated on every fifth step, as stable-baselines does."""
+
 
 class Size(NamedTuple):
     """How much of an environment is stepped at once.
@@ -60,11 +63,12 @@ def random_agent(env: Env, num_envs: int, num_steps: int) -> Agent:
 
 
 def make_agent(name: str, env: Env, size: Size) -> Agent:
-    """Build one of our learners, with the presets' settings for all but the size, or `RANDOM`."""
+    """Build one of our learners, as in the presets but for the size and `FIFTH`, or `RANDOM`."""
     if name == RANDOM:
         return random_agent(env, size.num_envs, size.num_steps)
-    if name == "trpo":
-        return trpo.make(env, TRPOConfig(size.num_envs, size.num_steps))
+    if name in ("trpo", FIFTH):
+        share = 0.2 if name == FIFTH else TRPOConfig.fisher_share
+        return trpo.make(env, TRPOConfig(size.num_envs, size.num_steps, fisher_share=share))
     return ppo.make(env, PPOConfig(size.num_envs, size.num_steps))
 
 
