@@ -82,7 +82,8 @@ def longest_errors(
         how: Names the recordings that are held out.
 
     Returns:
-        None where segments of `problem` are as long.
+        None where segments of `problem` are as long, or where the integrator's error over longer
+        ones would hide any other.
     """
     longer = cut_longest(problem, recordings, grid, theta)
     if longer is None:
@@ -92,7 +93,8 @@ def longest_errors(
     after = settle(longer, theta, after.start)
     before = settle(longer, longer.simulator.base, longer.segments.start)
     floor = noise_floor(longer, make_metric(longer), after)
-    return errors_of(longer, (before, after), floor.error, host, how)
+    errors = errors_of(longer, (before, after), floor.error, host, how)
+    return None if errors.is_too_coarse else errors
 
 
 def are_explained(error: Errors, longest: Errors | None) -> bool:

@@ -121,7 +121,8 @@ def cut_longer(
     Returns:
         The problem of longer segments and a fit of their initial states, or None.
     """
-    for longer in _predictable(problem, recordings, grid, theta):
+    everything = np.arange(len(recordings))
+    for longer, _ in _predictable(problem, recordings, grid, theta, everything):
         settled = settle(longer, theta, longer.segments.start)
         error = _error(longer.unwhiten(settled.residual), longer.segments)
         if _is_within(error.max(axis=1)):
@@ -132,26 +133,41 @@ def cut_longer(
 def cut_longest(
     problem: AnyProblem, recordings: Sequence[Recording], grid: Grid, theta: np.ndarray
 ) -> AnyProblem | None:
-    """Cut as `cut_longer`, however much the model errs; None where no longer segments do.
+    """Cut what is held out into the longest segments in which small changes do not grow.
 
-    Over these a small change of the initial state hardly grows: the error there is the model's.
+    As `cut_longer`, but however much the model errs: without growth the error is the model's. The
+    few segments within which changes do grow are left out.
+
+    Returns:
+        Segments that are held out, and no other; None where none can be longer.
     """
-    return next(_predictable(problem, recordings, grid, theta), None)
+    held_out = np.unique(problem.segments.recording[~problem.fitted])
+    for longer, growth in _predictable(problem, recordings, grid, theta, held_out):
+        return longer.take(growth <= 1.0)
+    return None
 
 
 def _predictable(
-    problem: AnyProblem, recordings: Sequence[Recording], grid: Grid, theta: np.ndarray
-) -> Iterator[AnyProblem]:
-    """Yield the problems of longer segments over which perturbations do not grow, longest first."""
+    problem: AnyProblem,
+    recordings: Sequence[Recording],
+    grid: Grid,
+    theta: np.ndarray,
+    chosen: np.ndarray,
+) -> Iterator[tuple[AnyProblem, np.ndarray]]:
+    """Yield longer segments of chosen recordings over which perturbations hardly grow.
+
+    Longest first, each with its segments' growth [S], at most 1 in most.
+    """
     fitted = np.unique(problem.segments.recording[problem.fitted])
-    for horizon in _possible(recordings):
+    for horizon in _possible([recordings[number] for number in chosen]):
         segments = cut(recordings, grid, horizon)
+        segments = segments.take(np.isin(segments.recording, chosen))
         if segments.measured.shape[1] <= problem.segments.measured.shape[1]:
             break
-        growth = _growth(_perturbed(problem.simulator, theta, segments), segments)
-        if _is_within(growth.max(axis=1)):
+        growth = _growth(_perturbed(problem.simulator, theta, segments), segments).max(axis=1)
+        if _is_within(growth):
             seen = np.isin(segments.recording, fitted)
-            yield dataclasses.replace(problem, segments=segments, fitted=seen)
+            yield dataclasses.replace(problem, segments=segments, fitted=seen), growth
 
 
 def _possible(recordings: Sequence[Recording]) -> list[float]:

@@ -43,7 +43,7 @@ from garat_jax.diagnosis.metric import (
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rivals import fill_out, refine
 from garat_jax.diagnosis.screen import screen
-from garat_jax.diagnosis.starts import Fit, settle
+from garat_jax.diagnosis.starts import Fit, settle, settle_twice
 from garat_jax.diagnosis.steps import Step, prune, refitted, swap
 from garat_jax.diagnosis.timestep import count_timestep
 
@@ -163,7 +163,7 @@ def explain(
         before = settle(found.problem, found.problem.simulator.base, longer[1].start)
     problem, steps, current = found.problem, found.steps, found.fit
     if steps:
-        current = found.timeless or count_timestep(problem, current)
+        current = settle_twice(problem, found.timeless or count_timestep(problem, current))
         steps[-1] = steps[-1]._replace(fit=current)
     shown = _as_shown(problem, steps, current)
     selected = tuple(shown[step.candidate.named] for step in steps)

@@ -74,6 +74,22 @@ def settle(problem: Problem, theta: np.ndarray, start: np.ndarray, iterations: i
     return Fit(theta, (), (), start, lin.residual, lin.start, nothing, nothing)
 
 
+def settle_twice(problem: Problem, found: Fit) -> Fit:
+    """Settle from what was measured, too; of each segment the better counts.
+
+    A fit has followed its initial states from one set of parameters to the next, in contact past
+    places from where no small step leads on.
+    """
+    fresh = settle(problem, found.theta, problem.segments.start)
+    better = fresh.cost < found.cost
+    return dataclasses.replace(
+        found,
+        start=np.where(better[:, None], fresh.start, found.start),
+        residual=np.where(better[:, None], fresh.residual, found.residual),
+        sensitivity=np.where(better[:, None, None], fresh.sensitivity, found.sensitivity),
+    )
+
+
 def follow(problem: Problem, theta, near: Fit) -> Fit:
     """Settle the initial states at parameters near those of a fit, with its sensitivities."""
     lin = linearise(problem, theta, near.start, (), (), near.sensitivity)

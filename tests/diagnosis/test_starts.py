@@ -14,7 +14,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem, linearise
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.simulate import columns_of
-from garat_jax.diagnosis.starts import measured_anew, settle, settle_anew
+from garat_jax.diagnosis.starts import measured_anew, settle, settle_anew, settle_twice
 from garat_jax.effects import AsymmetricFriction, ContactFriction
 from tests.diagnosis import pendulum, test_contact
 from tests.diagnosis.test_fit import make_problem
@@ -49,6 +49,26 @@ def test_a_puck_that_hops_is_put_back_on_the_table(puck):
     assert root_mean_square(anew.residual) < 1.1 * root_mean_square(settled.residual)
     again = linearise(puck, theta, start, (), ())
     np.testing.assert_allclose(again.residual, anew.residual, atol=1e-6)
+
+
+def test_of_two_places_to_settle_from_the_better_counts_in_each_segment(puck):
+    theta = np.array([FRICTION])
+    fresh = settle(puck, theta, puck.segments.start)
+    moved = settle(puck, np.array([0.5]), fresh.start)  # another model's initial states
+    lin = linearise(puck, theta, moved.start, (), ())
+    half = np.arange(len(fresh.start)) % 2 == 0
+    led_astray = dataclasses.replace(
+        fresh,
+        start=np.where(half[:, None], moved.start, fresh.start),
+        residual=np.where(half[:, None], lin.residual, fresh.residual),
+        sensitivity=np.where(half[:, None, None], lin.start, fresh.sensitivity),
+    )
+    twice = settle_twice(puck, led_astray)
+    assert twice.cost.sum() < 0.9 * led_astray.cost.sum()
+    assert np.all(twice.cost <= led_astray.cost)
+    np.testing.assert_array_equal(twice.start[~half], led_astray.start[~half])
+    again = linearise(puck, theta, twice.start, (), ())
+    np.testing.assert_allclose(again.residual, twice.residual, atol=1e-6)
 
 
 def test_segments_near_their_noise_are_left_alone(puck):
