@@ -59,7 +59,7 @@ def run_case(name: str, folder: Path, out: Path, command: str) -> dict[str, Any]
         "case": name,
         "verdict": result.verdict,
         "selected": selected,
-        "error": result.error,
+        "error": result.decisive,
         "candidates": [{name: getattr(c, name) for name in said} for c in result.candidates],
         "seconds": result.seconds,
     }

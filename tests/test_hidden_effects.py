@@ -254,7 +254,7 @@ def scored(truth, *selected, verdict="missing_effect"):
         verdict=verdict,
         selected=selected,
         candidates=selected,
-        error=SimpleNamespace(unexplained_share=0.0),
+        decisive=SimpleNamespace(unexplained_share=0.0),
         seconds=1.0,
     )
     return score(found, truth, SCENES["arm2"].model)

@@ -95,7 +95,7 @@ def score(found: Diagnosis, truth: Truth, model: mujoco.MjModel) -> dict[str, An
         "claimed": [[str(n) for n in names(c)] for c in found.selected],
         "first": [str(n) for n in names(first)] if first else [],
         "first_fails": "" if first is None or first.passes else first.why,
-        "unexplained_share": found.error.unexplained_share,
+        "unexplained_share": found.decisive.unexplained_share,
         "seconds": found.seconds,
     }
     category = truth.case.category
@@ -200,6 +200,7 @@ def aggregate(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     done = [row for row in rows if row["status"] != NOT_YET]
     of = {name: [r for r in done if r["category"] == name] for name in CATEGORIES}
     singles = of["single"]
+    clean = [{**row, "adequate": row.get("verdict") == "adequate"} for row in of["clean"]]
     lines = [
         _share("right kind first", singles, "kind_first", 0.95),
         _share("right kind first and past every gate", singles, "kind_claimed", None),
@@ -207,7 +208,8 @@ def aggregate(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                "alone", None),
         _share("right joint or body", singles, "place_right", 0.95),
         _share("pairs, both found", of["pair"], "ok", 0.85),
-        _share("clean, nothing claimed", of["clean"], "ok", 0.95),
+        _share("clean, nothing claimed", clean, "ok", 0.95),
+        _share("of these seen to be adequate", clean, "adequate", None),
         _share("outside, unexplained", of["outside"], "ok", 0.90),
     ]  # fmt: skip
     estimates = [e | {"case": r["case"]} for r in done for e in r.get("estimates", [])]

@@ -108,9 +108,9 @@ def write_cards(run: RunDirectory, model: Model, found: Diagnosis) -> None:
 
 
 def _is_clear(found: Diagnosis) -> bool:
-    """Say whether so little of the error stays that it cannot mislead a fit."""
-    little = found.error.unexplained_share <= UNEXPLAINED
-    return found.verdict == "adequate" or (bool(found.selected) and little)
+    """Say whether so little of the error stays, in what is fitted, that it cannot mislead a fit."""
+    error = found.error
+    return error.unexplained_share <= UNEXPLAINED if found.selected else error.is_adequate
 
 
 class _Place(NamedTuple):

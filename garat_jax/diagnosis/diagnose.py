@@ -23,7 +23,7 @@ from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rank import Outcome, explain
-from garat_jax.diagnosis.results import Diagnosis, Errors, Rung, Verdict
+from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import SHORTEST, choose_grid
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
@@ -90,7 +90,7 @@ def diagnose(
         holdout=tuple(r.name for r in held_out),
         versions=versions(),
         seconds=0.0,
-        verdict=_verdict(outcome, error, longest),
+        verdict=verdict_of(outcome.adequate, outcome.selected, error, longest),
         error=error,
         longest=longest,
         where=tuple(localise(missing_torque(host, everything))),
@@ -177,11 +177,20 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
     return tuple(candidates)
 
 
-def _verdict(outcome: Outcome, error: Errors, longest: Errors | None) -> Verdict:
-    if outcome.adequate and not error.is_too_coarse:
-        return "adequate" if longest is None or longest.is_near_floor else "unexplained"
-    explained = outcome.selected and are_explained(error, longest)
-    return "missing_effect" if explained else "unexplained"
+def verdict_of(
+    adequate: bool, selected: Sequence[Candidate], error: Errors, longest: Errors | None
+) -> Verdict:
+    """Return the verdict.
+
+    Args:
+        adequate: Whether the model as it is comes near the noise in what was fitted.
+        selected: What was found.
+        error: The held-out errors with it.
+        longest: The same over the longest segments; see `longest_errors`.
+    """
+    if adequate and not error.is_too_coarse:
+        return "adequate" if longest is None or longest.is_adequate else "unexplained"
+    return "missing_effect" if selected and are_explained(error, longest) else "unexplained"
 
 
 def _ladder(problem: Problem, outcome: Outcome) -> tuple[Rung, ...]:

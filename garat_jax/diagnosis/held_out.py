@@ -8,7 +8,7 @@ import numpy as np
 from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.horizon import cut_longest
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.metric import make_metric, noise_floor, trusted
+from garat_jax.diagnosis.metric import Floor, make_metric, noise_floor, signals_above, trusted
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import Grid
@@ -16,7 +16,7 @@ from garat_jax.diagnosis.starts import Fit, settle
 
 
 def errors_of(
-    problem: Problem, fits: tuple[Fit, Fit], floor: float, host: mujoco.MjModel, how: str
+    problem: Problem, fits: tuple[Fit, Fit], floor: Floor, host: mujoco.MjModel, how: str
 ) -> Errors:
     """Return the held-out errors of the model as it is and with what was found.
 
@@ -47,9 +47,10 @@ def errors_of(
             "noise_floor": noise,
             "unit": listed[i].unit,
         }
+    above = signals_above(problem, metric, fits[1], floor)
     before, after = (metric.error(fit.residual, held_out) for fit in fits)
     return Errors.above(
-        floor,
+        floor.error,
         metric.of_noise(held_out),
         metric=metric_in_words(problem, how),
         horizon=problem.horizon,
@@ -57,6 +58,7 @@ def errors_of(
         after=after,
         timestep=problem.simulator.host.opt.timestep,
         per_signal=per_signal,
+        above_floor=tuple(listed[i].name for i in np.flatnonzero(above)),
     )
 
 
@@ -93,7 +95,7 @@ def longest_errors(
     after = settle(longer, theta, after.start)
     before = settle(longer, longer.simulator.base, longer.segments.start)
     floor = noise_floor(longer, make_metric(longer), after)
-    errors = errors_of(longer, (before, after), floor.error, host, how)
+    errors = errors_of(longer, (before, after), floor, host, how)
     return None if errors.is_too_coarse else errors
 
 

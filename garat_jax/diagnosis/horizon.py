@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from garat_jax.diagnosis.measurements import Recording, longest_span
-from garat_jax.diagnosis.problem import AnyProblem, Predictor
+from garat_jax.diagnosis.problem import AnyProblem, Predictor, Problem
 from garat_jax.diagnosis.segments import QUIET, Grid, Segments, cut
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.errors import UserError
@@ -131,8 +131,8 @@ def cut_longer(
 
 
 def cut_longest(
-    problem: AnyProblem, recordings: Sequence[Recording], grid: Grid, theta: np.ndarray
-) -> AnyProblem | None:
+    problem: Problem, recordings: Sequence[Recording], grid: Grid, theta: np.ndarray
+) -> Problem | None:
     """Cut what is held out into the longest segments in which small changes do not grow.
 
     As `cut_longer`, but however much the model errs: without growth the error is the model's. The

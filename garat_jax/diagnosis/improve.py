@@ -79,7 +79,7 @@ class Improvement:
     def to_json(self) -> dict[str, Any]:
         """Return the content of improve.json."""
         whole = self.diagnosis.to_json()
-        kept = ("model", "data", "holdout", "versions", "verdict", "error", "ladder")
+        kept = ("model", "data", "holdout", "versions", "verdict", "error", "longest", "ladder")
         return {
             "format": FORMAT,
             **{key: whole[key] for key in kept},
@@ -177,7 +177,7 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
         Rung(candidate, metric.error(f.residual, seen), metric.error(f.residual, ~seen))
         for candidate, f in zip((None, *added), fits, strict=True)
     )
-    host, floor = simulator.host, noise_floor(problem, metric, fits[-1]).error
+    host, floor = simulator.host, noise_floor(problem, metric, fits[-1])
     error = errors_of(problem, (fits[0], fits[-1]), floor, host, how)
     return rungs, error, longest_errors(problem, final, everything, grid, host, how)
 
@@ -234,18 +234,20 @@ def run_improve(
 
 def _rounds_section(rounds: Sequence[Diagnosis]) -> Section:
     """Show what each diagnosis found in the model as the one before had left it."""
-    columns = ["diagnosis", "verdict", "adds", "before", "after", "noise floor", "unexplained [%]"]
+    columns = ["diagnosis", "verdict", "adds", "over [s]", "before", "after", "noise floor"]
+    columns.append("unexplained [%]")
     rows = [
         (
             number,
             found.verdict.replace("_", " "),
             ", ".join(str(c.named) for c in found.selected) or "nothing",
-            found.error.before,
-            found.error.after,
-            found.error.noise_floor,
-            round(100 * found.error.unexplained_share),
+            error.horizon,
+            error.before,
+            error.after,
+            error.noise_floor,
+            round(100 * error.unexplained_share),
         )
-        for number, found in enumerate(rounds, 1)
+        for number, (found, error) in enumerate(((r, r.decisive) for r in rounds), 1)
     ]
     text = (
         "Each diagnosis begins with what the ones before it added. A better model predicts for "

@@ -117,9 +117,20 @@ def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
     )
 
 
+def signals_above(
+    problem: Problem, metric: Metric, current: Fit, floor: Floor, by: float = ABOVE_FLOOR
+) -> np.ndarray:
+    """Say of each signal whether its held-out error is well above its noise floor, `by` times it.
+
+    Returns:
+        [num_signals] bool.
+    """
+    errors = metric.by_signal(current.residual, ~problem.fitted)
+    return errors > by * floor.by_signal
+
+
 def is_above(
     problem: Problem, metric: Metric, current: Fit, floor: Floor, by: float = ABOVE_FLOOR
 ) -> bool:
     """Say whether any signal's held-out error is well above its noise floor, `by` times it."""
-    errors = metric.by_signal(current.residual, ~problem.fitted)
-    return bool(np.any(errors > by * floor.by_signal))
+    return bool(np.any(signals_above(problem, metric, current, floor, by)))

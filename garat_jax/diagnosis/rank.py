@@ -105,7 +105,7 @@ class Outcome(NamedTuple):
     candidates: tuple[Candidate, ...]
     steps: tuple[Step, ...]
     selected: tuple[Candidate, ...]
-    floor: float
+    floor: Floor
     adequate: bool
     best: Fit | None
 
@@ -178,7 +178,7 @@ def explain(
         _without_superfluous(candidates, selected),
         tuple(steps),
         selected,
-        found.floor.error,
+        found.floor,
         adequate and not steps,
         best,
     )

@@ -89,10 +89,9 @@ def _verdict(diagnosis: Diagnosis) -> str:
     )
     if diagnosis.verdict == "missing_effect":
         return f"The model lacks {names}. With it, {fall}."
-    rest = f"{_percent(error.unexplained_share)} of the error{over} stays unexplained"
     if names:
-        return f"The model lacks {names}, but that is not all. With it, {fall}: {rest}."
-    return f"Something is missing that no effect in the catalogue explains: {rest}."
+        return f"The model lacks {names}, but that is not all. With it, {fall}: {diagnosis.rest}."
+    return f"Something is missing that no effect in the catalogue explains: {diagnosis.rest}."
 
 
 def _label_with_alike(candidate: Candidate) -> str:
@@ -107,11 +106,14 @@ def _label_with_alike(candidate: Candidate) -> str:
 def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     """Return the numbers of a diagnosis to be seen first."""
     error, over = diagnosis.decisive, diagnosis.over
+    rest = Fact(_percent(error.unexplained_share), "of the error stays unexplained")
+    if not diagnosis.selected and error.is_near_floor and error.above_floor:
+        rest = Fact(str(len(error.above_floor)), "signals stay well above their noise floor")
     return [
         Fact(_percent(error.before), f"error of the model as it is{over}, of each signal's spread"),
         Fact(_percent(error.after), f"error{over} with the effects that were found"),
         Fact(_percent(error.noise_floor), "noise floor: what noise alone would make"),
-        Fact(_percent(error.unexplained_share), "of the error stays unexplained"),
+        rest,
     ]
 
 
@@ -133,7 +135,7 @@ def diagnosis_sections(
     everything = (*fitted, *held_out)
     view = look(model, everything, range(len(fitted), len(everything)), diagnosis.selected)
     return [
-        _errors(diagnosis.error, view),
+        _errors(diagnosis.decisive, view),
         traces(view),
         *([] if diagnosis.verdict == "adequate" else _where(diagnosis.where, view)),
         *_ranking(diagnosis),

@@ -61,6 +61,7 @@ class Errors:
         timestep: Seconds of a step of the physics.
         integrator: What the integrator's error alone makes at this timestep.
         horizon: Seconds of the segments that are predicted.
+        above_floor: The signals whose error stays well above their noise floor.
     """
 
     metric: str
@@ -73,6 +74,7 @@ class Errors:
     timestep: float = math.nan
     integrator: float = 0.0
     horizon: float = math.nan
+    above_floor: tuple[str, ...] = ()
 
     @classmethod
     def above(
@@ -86,14 +88,19 @@ class Errors:
         after: float,
         timestep: float,
         per_signal: Mapping[str, Mapping[str, float | str]],
+        above_floor: tuple[str, ...] = (),
     ) -> "Errors":
-        """Hold errors against their floor, of which noise alone makes `of_noise`."""
+        """Hold errors against their floor, of which noise alone makes `of_noise`.
+
+        A model may err more than predicting the mean would, 1; what is left is then held against
+        that.
+        """
         integrator = math.sqrt(max(floor**2 - of_noise**2, 0.0))
         rest = math.sqrt(max(after**2 - floor**2, 0.0))
-        share = rest / before if before > 0 else 0.0
+        share = rest / min(before, 1.0) if before > 0 else 0.0
         share = 1.0 if integrator > TOO_COARSE else share
         known = (before, after, floor, share, per_signal, timestep, integrator, horizon)
-        return cls(metric, "1", *known)
+        return cls(metric, "1", *known, above_floor)
 
     @property
     def is_too_coarse(self) -> bool:
@@ -104,6 +111,11 @@ class Errors:
     def is_near_floor(self) -> bool:
         """Whether what is left is what noise, and an integrator that can be trusted, make."""
         return self.after <= ABOVE_FLOOR * self.noise_floor and not self.is_too_coarse
+
+    @property
+    def is_adequate(self) -> bool:
+        """Whether no signal's error is well above its noise floor, and this can be judged."""
+        return not self.above_floor and not self.is_too_coarse
 
     @property
     def is_explained(self) -> bool:
@@ -216,10 +228,18 @@ class Diagnosis:
         names = " and ".join(str(c.named) for c in self.selected)
         if self.verdict == "missing_effect":
             return f"Missing: {names} ({fall}, noise floor {floor})."
-        share = f"{100 * error.unexplained_share:.0f} % of the error{over}"
         if names:
-            return f"Found {names} ({fall}, noise floor {floor}), but {share} stays unexplained."
-        return f"Nothing in the catalogue explains the error: {share} stays unexplained."
+            return f"Found {names} ({fall}, noise floor {floor}), but {self.rest}."
+        return f"Nothing in the catalogue explains the error: {self.rest}."
+
+    @property
+    def rest(self) -> str:
+        """What stays unexplained, as a clause."""
+        error, over = self.decisive, self.over
+        if not self.selected and error.is_near_floor and error.above_floor:
+            loud = ", ".join(error.above_floor)
+            return f"that of {loud}{over} stays well above its noise floor"
+        return f"{100 * error.unexplained_share:.0f} % of the error{over} stays unexplained"
 
     @property
     def decisive(self) -> Errors:
@@ -231,7 +251,7 @@ class Diagnosis:
 
     def _is_right(self, error: Errors) -> bool:
         """Whether errors alone would say that nothing, or nothing more, is missing."""
-        return error.is_explained if self.selected else error.is_near_floor
+        return error.is_explained if self.selected else error.is_adequate
 
     @property
     def over(self) -> str:

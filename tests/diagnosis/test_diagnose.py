@@ -3,13 +3,16 @@
 Data come from C MuJoCo at a 32nd of the model's timestep. Thresholds were chosen on seeds 0 to 9.
 """
 
+import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from garat_jax.diagnosis import Recording, diagnose, load_model
 from garat_jax.diagnosis.convert import free_pendulum
+from garat_jax.diagnosis.diagnose import verdict_of
 from garat_jax.diagnosis.hidden import DRAWN, OUTSIDE, make_recordings
 from garat_jax.diagnosis.results import Errors
 from garat_jax.runs import RunDirectory
@@ -81,6 +84,40 @@ def test_a_gap_is_explained_if_little_is_left_and_that_near_the_floor(
     after, floor, share, explained
 ):
     assert Errors("", "1", 1.0, after, floor, share, {}).is_explained is explained
+
+
+def test_what_is_left_of_a_model_that_runs_away_is_held_against_the_spread():
+    of = {"metric": "", "horizon": 1.0, "timestep": 0.01, "per_signal": {}}
+    errors = Errors.above(0.01, 0.01, before=1e6, after=0.3, **of)
+    assert errors.unexplained_share == pytest.approx(0.3, rel=1e-2)
+    assert not errors.is_explained
+
+
+EXPLAINED = Errors("", "1", 1.0, 0.1, 0.08, 0.06, {})
+LEFT = dataclasses.replace(EXPLAINED, after=0.5, unexplained_share=0.5)
+LOUD = dataclasses.replace(EXPLAINED, above_floor=("qvel.hinge",))
+COARSE = dataclasses.replace(EXPLAINED, integrator=0.8)
+FOUND = (SimpleNamespace(effect="coulomb_friction"),)
+
+
+@pytest.mark.parametrize(
+    ("adequate", "selected", "error", "longest", "verdict"),
+    [
+        (True, (), EXPLAINED, None, "adequate"),
+        (True, (), EXPLAINED, EXPLAINED, "adequate"),
+        (True, (), EXPLAINED, LOUD, "unexplained"),
+        (True, (), COARSE, None, "unexplained"),
+        (False, (), EXPLAINED, None, "unexplained"),
+        (False, FOUND, EXPLAINED, None, "missing_effect"),
+        (False, FOUND, EXPLAINED, EXPLAINED, "missing_effect"),
+        (False, FOUND, EXPLAINED, LEFT, "unexplained"),
+        (False, FOUND, LEFT, EXPLAINED, "unexplained"),
+    ],
+)
+def test_the_longest_segments_have_a_say_in_the_verdict(
+    adequate, selected, error, longest, verdict
+):
+    assert verdict_of(adequate, selected, error, longest) == verdict
 
 
 @pytest.mark.slow

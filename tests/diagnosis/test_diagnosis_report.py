@@ -127,6 +127,29 @@ def test_long_segments_that_show_no_gap_do_not_decide():
     assert not_all.over == ""
 
 
+def test_a_gap_in_single_signals_is_not_said_to_be_0_percent_of_the_error():
+    error = dataclasses.replace(
+        MISSING.error, after=0.011, unexplained_share=0.0, above_floor=("qvel.hinge",)
+    )
+    diagnosis = dataclasses.replace(ADEQUATE, verdict="unexplained", error=error)
+    assert diagnosis.sentence == (
+        "Nothing in the catalogue explains the error: that of qvel.hinge stays well above its "
+        "noise floor."
+    )
+    assert diagnosis_lead(diagnosis).endswith(
+        "that of qvel.hinge stays well above its noise floor."
+    )
+    assert diagnosis_facts(diagnosis)[-1].value == "1"
+
+
+def test_a_model_that_is_adequate_in_what_was_fitted_only_is_judged_over_long_segments():
+    error = dataclasses.replace(MISSING.error, before=0.011, after=0.011, unexplained_share=0.0)
+    longest = dataclasses.replace(LONGEST, after=0.9, above_floor=("qpos.hinge",))
+    diagnosis = dataclasses.replace(ADEQUATE, verdict="unexplained", error=error, longest=longest)
+    assert diagnosis.decisive is longest
+    assert diagnosis.sentence.endswith(": 10 % of the error over 2 s stays unexplained.")
+
+
 def test_page_of_a_missing_effect_has_every_part(tmp_path):
     page = write(tmp_path, MISSING)
     for heading in (
