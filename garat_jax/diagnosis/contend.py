@@ -84,32 +84,32 @@ def fit_contenders(
 def fit_refinements(
     problem: Problem,
     current: Fit,
-    best: Contender,
+    contender: Contender,
     scores: Sequence[Score],
     say: Callable[[str], None],
     hidden_only: bool,
 ) -> list[Contender]:
-    """Fit the laws that refine the best contender's at its place.
+    """Fit the laws that refine a contender's at its place.
 
     A law that acted before it was fitted is left as it is.
 
     Args:
         problem: The recordings and the model with every candidate.
         current: The fit of the effects selected so far.
-        best: The contender that fits best.
+        contender: Whose law they refine.
         scores: What screening says.
         say: Told what is being done.
         hidden_only: Leave out the laws that screening sees, because they have no threshold.
     """
-    simple = best.score.effect
+    simple = contender.score.effect
     if _acts(problem, simple, current.theta):
         return []
-    rival = best.fit.cost[problem.fitted].sum()
+    rival = contender.fit.cost[problem.fitted].sum()
     return [
         _fit(problem, current, refined, rival, say)
         for score in scores
         if refines(problem, score.effect, simple)
-        and (refined := as_refined(problem, score, best.fit.theta, [simple]))
+        and (refined := as_refined(problem, score, contender.fit.theta, [simple]))
         and (not hidden_only or problem.num_listed(score.effect) > 1)
     ]
 
@@ -182,21 +182,23 @@ def as_refined(problem: Problem, score: Score, theta: np.ndarray, simpler: Seque
     return dataclasses.replace(score, columns=tuple(start), start=start) if start else None
 
 
-def fit_further(problem: Problem, best: Contender, say: Callable[[str], None]) -> list[Contender]:
-    """Fit the best contender with its further parameters, if screening left some out.
+def fit_further(
+    problem: Problem, contender: Contender, say: Callable[[str], None]
+) -> list[Contender]:
+    """Fit a contender with its further parameters, if screening left some out.
 
     Beside a large effect, a parameter that matters later explains a small part only.
     """
-    columns = columns_of(problem.simulator.slots, best.score.effect).values()
-    further = [j for j in columns if j not in best.fit.free]
+    columns = columns_of(problem.simulator.slots, contender.score.effect).values()
+    further = [j for j in columns if j not in contender.fit.free]
     if not further:
         return []
-    effect = problem.simulator.effects[best.score.effect]
+    effect = problem.simulator.effects[contender.score.effect]
     say(f"fitting every parameter of {effect.kind} at {effect.target}")
-    free = (*best.fit.free, *further)
-    start, sensitivity = best.fit.start, best.fit.sensitivity
-    fitted = fit(problem, best.fit.theta, start, free, sensitivity=sensitivity)
-    score = dataclasses.replace(best.score, columns=(*best.score.columns, *further))
+    free = (*contender.fit.free, *further)
+    start, sensitivity = contender.fit.start, contender.fit.sensitivity
+    fitted = fit(problem, contender.fit.theta, start, free, sensitivity=sensitivity)
+    score = dataclasses.replace(contender.score, columns=(*contender.score.columns, *further))
     return [Contender(score, fitted)]
 
 

@@ -1,6 +1,7 @@
 """One law under two names is fitted once; two laws that look alike are fitted twice."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -60,17 +61,17 @@ def test_the_names_of_a_fit_go_where_more_of_its_law_explains_more(monkeypatch):
     assert kept is fuller
 
 
+def with_error(contender, error: float, effect: int | None = None):
+    """Return a contender that leaves as much as another's residual times `error`."""
+    fit = dataclasses.replace(contender.fit, residual=error * contender.fit.residual)
+    effect = contender.score.effect if effect is None else effect
+    score = dataclasses.replace(contender.score, effect=effect)
+    return dataclasses.replace(contender, fit=fit, score=score)
+
+
 def test_more_of_a_law_is_tried_of_all_that_fit_as_well(monkeypatch):
     (one, other), _ = contenders_of("Euler")
-
-    def with_error(contender, error):
-        residual = error * one.fit.residual
-        return dataclasses.replace(
-            contender, fit=dataclasses.replace(contender.fit, residual=residual)
-        )
-
-    best, as_good, worse = with_error(one, 1.0), with_error(other, 1.001), with_error(one, 3.0)
-    worse = dataclasses.replace(worse, score=dataclasses.replace(worse.score, effect=2))
+    best, as_good, worse = with_error(one, 1.0), with_error(other, 1.001), with_error(one, 3.0, 2)
     fuller, tried = with_error(other, 0.5), []
 
     def fit_further(_, contender, say):
@@ -83,3 +84,40 @@ def test_more_of_a_law_is_tried_of_all_that_fit_as_well(monkeypatch):
     kept = rivals.fill_out(None, None, [best, as_good, worse], None, print)
     assert [id(c) for c in tried] == [id(best), id(as_good)]
     assert [id(c) for c in kept] == [id(fuller), id(best), id(worse)]
+
+
+def test_refinements_are_tried_of_all_that_fit_as_well_and_replace_no_better_fit(monkeypatch):
+    (one, _), _ = contenders_of("Euler")
+    best, as_good = with_error(one, 1.0, 0), with_error(one, 1.001, 1)
+    worse, known = with_error(one, 3.0, 2), with_error(one, 0.9999, 3)
+    of_as_good, of_known, tried = with_error(one, 0.5, 4), with_error(one, 0.92, 3), []
+
+    def fit_refinements(problem, current, contender, scores, say, hidden_only):
+        tried.append((contender, hidden_only))
+        return {id(as_good): [of_as_good], id(best): [of_known]}.get(id(contender), [])
+
+    monkeypatch.setattr(rivals, "is_above", lambda *_: True)
+    monkeypatch.setattr(rivals, "fit_refinements", fit_refinements)
+    monkeypatch.setattr(rivals, "leads", lambda _, a, b: a.cost.sum() < 0.8 * b.cost.sum())
+    monkeypatch.setattr(rivals, "held_out_gain", lambda *_: SimpleNamespace(low=0.1))
+    contenders = [best, as_good, worse, known]
+    kept = rivals.refine(None, None, None, (), contenders, None, print)
+    assert {id(contender) for contender, _ in tried} == {id(c) for c in (best, as_good, known)}
+    assert not any(hidden_only for _, hidden_only in tried)  # none waits for another round
+    assert {id(c) for c in kept} == {id(c) for c in (of_as_good, best, worse, known)}
+
+
+def test_a_law_without_rivals_that_proves_itself_is_refined_in_the_next_round(monkeypatch):
+    (one, _), _ = contenders_of("Euler")
+    waits = []
+
+    def fit_refinements(problem, current, contender, scores, say, hidden_only):
+        waits.append(hidden_only)
+        return []
+
+    monkeypatch.setattr(rivals, "is_above", lambda *_: True)
+    monkeypatch.setattr(rivals, "fit_refinements", fit_refinements)
+    for low in (0.1, -0.1):
+        monkeypatch.setattr(rivals, "held_out_gain", lambda *_, low=low: SimpleNamespace(low=low))
+        rivals.refine(None, None, None, (), [one], None, print)
+    assert waits == [True, False]
