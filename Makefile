@@ -30,7 +30,7 @@ $(STAMP): requirements.lock pyproject.toml
 		|| { echo "make setup: Python 3.11 or newer is needed; name one: make setup PYTHON=python3.11" >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) install --quiet -r requirements.lock || $(MAKE) --no-print-directory install-without-locked-nightly
-	$(PIP) install --quiet --no-deps --no-build-isolation -e .
+	$(PIP) install --quiet --no-deps --no-build-isolation --config-settings editable_mode=compat -e .
 	@touch $@
 
 # For the day when no build in the locked range of tfp-nightly is left in the registry.

@@ -131,7 +131,7 @@ def test_setup_installs_the_lock_and_then_the_package(make):
     installs = [line.partition("install ")[2] for line in log if "install" in line]
     assert installs == [
         "--quiet -r requirements.lock",
-        "--quiet --no-deps --no-build-isolation -e .",
+        "--quiet --no-deps --no-build-isolation --config-settings editable_mode=compat -e .",
     ]
 
 

@@ -155,8 +155,8 @@ def true_error(
 ) -> float | None:
     """Return the held-out error of the catalogue's effects at their true parameters.
 
-    Metric, segments and timestep are those of the diagnosis. Initial states are settled from what was
-    measured; those of the diagnosis from where its fits have led, too.
+    Metric, segments and timestep are those of the diagnosis. Initial states are settled from what
+    was measured; those of the diagnosis from where its fits have led, too.
     None where the catalogue has no such effect: outside it, and with a nuisance delay unless the
     catalogue has delays.
     """

@@ -71,7 +71,8 @@ def diagnose(
         Simulator(model, (*shared, *others), grid, refine, acting=range(len(shared)))
         for refine in (1, 2)
     )
-    warnings = warn_of_divergence(simulator, finer, everything, grid, horizon)
+    warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
+    warnings += warn_of_divergence(simulator, finer, everything, grid, horizon)
     sample = grid.interval * grid.per_sample
     suggested = suggest(simulator.effects, host, fitted)
     seen = segments.recording < len(fitted)

@@ -1,6 +1,6 @@
 """The errors on held-out recordings that are reported."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -8,7 +8,15 @@ import numpy as np
 from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.horizon import cut_longest
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.metric import Floor, make_metric, noise_floor, signals_above, trusted
+from garat_jax.diagnosis.metric import (
+    Floor,
+    Metric,
+    make_metric,
+    noise_floor,
+    signals_above,
+    signals_mostly_above,
+    trusted,
+)
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import Grid
@@ -16,7 +24,12 @@ from garat_jax.diagnosis.starts import Fit, settle
 
 
 def errors_of(
-    problem: Problem, fits: tuple[Fit, Fit], floor: Floor, host: mujoco.MjModel, how: str
+    problem: Problem,
+    fits: tuple[Fit, Fit],
+    floor: Floor,
+    host: mujoco.MjModel,
+    how: str,
+    above: Callable[[Problem, Metric, Fit, Floor], np.ndarray] = signals_above,
 ) -> Errors:
     """Return the held-out errors of the model as it is and with what was found.
 
@@ -26,6 +39,7 @@ def errors_of(
         floor: What noise and the integrator's error make; see `metric.noise_floor`.
         host: The compiled model.
         how: Names the recordings that are held out.
+        above: Which signals count as well above their floor, [num_signals].
     """
     metric, held_out = make_metric(problem), ~problem.fitted
     segments = problem.segments
@@ -47,7 +61,7 @@ def errors_of(
             "noise_floor": noise,
             "unit": listed[i].unit,
         }
-    above = signals_above(problem, metric, fits[1], floor)
+    loud = np.flatnonzero(above(problem, metric, fits[1], floor))
     before, after = (metric.error(fit.residual, held_out) for fit in fits)
     return Errors.above(
         floor.error,
@@ -58,7 +72,7 @@ def errors_of(
         after=after,
         timestep=problem.simulator.host.opt.timestep,
         per_signal=per_signal,
-        above_floor=tuple(listed[i].name for i in np.flatnonzero(above)),
+        above_floor=tuple(listed[i].name for i in loud),
     )
 
 
@@ -95,7 +109,7 @@ def longest_errors(
     after = settle(longer, theta, after.start)
     before = settle(longer, longer.simulator.base, longer.segments.start)
     floor = noise_floor(longer, make_metric(longer), after)
-    errors = errors_of(longer, (before, after), floor, host, how)
+    errors = errors_of(longer, (before, after), floor, host, how, signals_mostly_above)
     return None if errors.is_too_coarse else errors
 
 

@@ -21,8 +21,9 @@ STABLE = 0.8
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
+BEHIND = "another explains more for certain"
 NO_CERTAIN_GAIN = "the held-out error does not fall for certain"
-ANOTHER_MAY_HELP = (NO_CERTAIN_LEAD, NO_CERTAIN_GAIN)
+ANOTHER_MAY_HELP = (NO_CERTAIN_LEAD, NO_CERTAIN_GAIN, BEHIND)
 """What may keep a candidate back only because of another effect that is missing, too."""
 RESAMPLES = 500
 
@@ -144,7 +145,7 @@ def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stabil
     if gain.low <= 0:
         return NO_CERTAIN_GAIN
     if lead <= 0:
-        return NO_CERTAIN_LEAD
+        return NO_CERTAIN_LEAD if np.isfinite(lead) else BEHIND
     if stability < STABLE:
         return f"first in only {100 * stability:.0f} % of the resamples"
     return ""

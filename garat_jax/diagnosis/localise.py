@@ -114,9 +114,11 @@ def localise(missing: MissingTorque) -> list[Place]:
             share = of_joint * size**2 * norm / max(float(torque @ torque), 1e-300)
             if share >= WORTH_TELLING:
                 unit = at_slide(unit) if slides else unit
+                # Words may say the direction in place of a sign.
+                shown = f"{abs(size):.3g}" if "{sign}" in words else f"{size:+.3g}"
                 evidence = (
                     f"{100 * share:.0f} % of the missing torque is at {name}, {regime}: "
-                    f"{size:+.3g}{' ' * bool(unit)}{unit}"
+                    f"{shown}{' ' * bool(unit)}{unit}"
                     + words.format(sign="with" if size > 0 else "against")
                 )
                 places.append(Place(name, share, regime, evidence))

@@ -129,6 +129,23 @@ def signals_above(
     return errors > by * floor.by_signal
 
 
+def signals_mostly_above(
+    problem: Problem, metric: Metric, current: Fit, floor: Floor
+) -> np.ndarray:
+    """Say of each signal whether it is well above its noise floor in most held-out segments.
+
+    Long segments are few: one whose initial state was not found would make a gap of its own.
+
+    Returns:
+        [num_signals] bool.
+    """
+    held_out = np.flatnonzero(~problem.fitted)
+    errors = np.stack(
+        [metric.by_signal(current.residual, held_out[[i]]) for i in range(len(held_out))]
+    )
+    return np.mean(errors > ABOVE_FLOOR * floor.by_signal, axis=0) > 0.5
+
+
 def is_above(
     problem: Problem, metric: Metric, current: Fit, floor: Floor, by: float = ABOVE_FLOOR
 ) -> bool:

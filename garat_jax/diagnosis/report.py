@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 NUM_WORST = 3
 """Segments that are shaded as the worst."""
+MOST_WARNINGS = 3
+"""Warnings that follow the result."""
 NUM_SIGNALS = 4
 """Signals that are drawn, those with the largest relative error."""
 
@@ -69,7 +71,9 @@ def diagnosis_lead(diagnosis: Diagnosis) -> str:
 
 
 def _with_warnings(lead: str, warnings: Sequence[str]) -> str:
-    return " ".join([lead, *(f"{warning[0].upper()}{warning[1:]}." for warning in warnings)])
+    shown = [f"{warning[0].upper()}{warning[1:]}." for warning in warnings[:MOST_WARNINGS]]
+    more = len(warnings) - len(shown)
+    return " ".join([lead, *shown, *([f"There are {more} more warnings."] if more > 0 else [])])
 
 
 def _verdict(diagnosis: Diagnosis) -> str:

@@ -21,6 +21,8 @@ UNIFORM = 0.01
 """Largest deviation of a sampling interval, relative to their median, that counts as uniform."""
 SHORTEST = 10
 """Samples that a segment must have."""
+SLOWEST = 0.5
+"""Seconds between samples, at most: a segment would last for 5 s, too long to be followed."""
 SMALLEST_NOISE = 1e-4
 """Noise assumed at least, relative to the signal's standard deviation."""
 UNKNOWN_NOISE = 1e-6
@@ -116,9 +118,17 @@ def choose_grid(recordings: Sequence[Recording], timestep: float) -> Grid:
     Uniform sampling: a step is a sample, in substeps no longer than the model's timestep. Otherwise
     a step is no longer than the model's timestep, commands are held on these steps, and
     predictions are interpolated linearly between them.
+
+    Raises:
+        UserError: Samples are too far apart to follow a motion.
     """
     intervals = np.concatenate([np.diff(r.time[a:b]) for r in recordings for a, b in r.spans])
     sample = float(np.median(intervals))
+    if sample > SLOWEST:
+        raise UserError(
+            f"the samples of the recordings are {sample:.4g} s apart, too far to follow a motion; "
+            f"at most {SLOWEST:g} s are. Is time in another unit than seconds? A map file names it"
+        )
     substeps = max(1, int(np.ceil(sample / timestep - 1e-6)))
     if np.abs(intervals - sample).max() <= UNIFORM * sample:
         return Grid(sample, substeps, 1, True)
@@ -148,6 +158,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     ]
     if not pieces:
         raise UserError(f"the recordings have no {SHORTEST} samples in a row; record for longer")
+    length = max(b - a for _, a, b in pieces)
     steps = max(_steps(recordings[i].time[a:b], grid) for i, a, b in pieces)
     warm_up = warm_up_steps(grid, recordings[0].ctrl.shape[1])
     before = [_past_steps(r, grid) for r in recordings]

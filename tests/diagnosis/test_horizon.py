@@ -12,11 +12,13 @@ from garat_jax.diagnosis.horizon import choose_horizon, cut_longer, cut_longest
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.report import diagnosis_lead
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.effects import CATALOGUE, MotorGain
+from garat_jax.errors import UserError
 from tests.diagnosis.pendulum import MODEL, record
 
 GAIN, PULL = 0.5, 0.008  # N m
@@ -81,6 +83,32 @@ def test_segments_are_no_longer_than_the_recordings():
     found = cut_longer(problem, recordings, grid, np.asarray([GAIN]))
     assert found
     assert found[0].horizon == pytest.approx(1.0)
+
+
+def test_recordings_shorter_than_any_horizon_are_followed_whole():
+    recordings = [dataclasses.replace(r, spans=((0, 30),)) for r in record_weak(0.0)]
+    grid = choose_grid(recordings, 0.002)
+    simulator = Simulator(MODEL, (MotorGain("actuator/motor"),), grid)
+    horizon, segments = choose_horizon(simulator, recordings, grid)
+    assert horizon == 0.2
+    assert segments.measured.shape[:2] == (4, 30)
+    predicted = simulator.predict(simulator.base[None], segments.start[None], segments)
+    assert predicted.shape[1:] == segments.measured.shape
+
+
+def test_samples_too_far_apart_to_follow_are_refused():
+    recordings = [dataclasses.replace(r, time=1e3 * r.time) for r in record_weak(0.0)]
+    with pytest.raises(UserError, match=r"4 s apart, too far to follow .* another unit than sec"):
+        choose_grid(recordings, 0.002)
+
+
+def test_what_is_odd_about_recordings_is_a_warning_of_their_diagnosis():
+    model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
+    recordings = record_weak(0.0)
+    recordings[1] = dataclasses.replace(recordings[1], warnings=("one.csv: is it in degrees?",))
+    found = diagnose(model, recordings)
+    assert found.warnings == ("one.csv: is it in degrees?",)
+    assert diagnosis_lead(found).endswith("One.csv: is it in degrees?.")
 
 
 def test_a_small_effect_is_found_that_a_large_one_hid():
