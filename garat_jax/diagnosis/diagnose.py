@@ -35,6 +35,8 @@ from garat_jax.effects import Effect
 from garat_jax.errors import UserError
 from garat_jax.provenance import versions
 
+FEWEST_SEGMENTS = 3
+"""Segments that have to be fitted for intervals and resamples to mean much."""
 ENOUGH = 250.0
 """Samples a second that a passive mechanism needs."""
 
@@ -82,6 +84,7 @@ def diagnose(
     problem = trusted(problem, settled)
     outcome = explain(problem, settled.start, say, lambda p, t: cut_longer(p, everything, grid, t))
     problem = outcome.problem
+    warnings += few_segments(problem)
     error = errors_of(problem, (outcome.before, outcome.after), outcome.floor, host, how)
     longest = longest_errors(problem, outcome.after.theta, everything, grid, host, how)
     explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
@@ -176,6 +179,18 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
                 continue
             candidates.append(cls(target=target, **cls.at(host, target)))
     return tuple(candidates)
+
+
+def few_segments(problem: Problem) -> tuple[str, ...]:
+    """Say that too little was recorded to be certain of anything; nothing where it suffices."""
+    num = int(problem.fitted.sum())
+    if num >= FEWEST_SEGMENTS:
+        return ()
+    pieces = f"{num} piece" + "s" * (num != 1)
+    return (
+        f"only {pieces} of {problem.horizon:.2g} s could be fitted, too few to be certain of an "
+        "effect or of an interval; record for longer",
+    )
 
 
 def verdict_of(

@@ -255,9 +255,9 @@ class Diagnosis:
 
     @property
     def over(self) -> str:
-        """Over how long segments the decisive errors are, where these are not those fitted."""
-        error = self.decisive
-        return "" if error is self.error else f" over {error.horizon:.2g} s"
+        """Over how long segments the decisive errors are, in words; empty if that is not known."""
+        horizon = self.decisive.horizon
+        return f" over {horizon:.2g} s" if math.isfinite(horizon) else ""
 
     @property
     def is_left(self) -> bool:

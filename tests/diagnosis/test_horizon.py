@@ -96,6 +96,16 @@ def test_recordings_shorter_than_any_horizon_are_followed_whole():
     assert predicted.shape[1:] == segments.measured.shape
 
 
+def test_a_diagnosis_of_a_moment_says_that_it_is_too_short():
+    model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
+    recordings = record_weak(0.0)[:2]
+    (warning,) = diagnose(
+        model, [dataclasses.replace(recording, spans=((0, 50),)) for recording in recordings]
+    ).warnings
+    assert warning.startswith("only 1 piece of 0.2 s could be fitted, too few")
+    assert not diagnose(model, recordings).warnings
+
+
 def test_samples_too_far_apart_to_follow_are_refused():
     recordings = [dataclasses.replace(r, time=1e3 * r.time) for r in record_weak(0.0)]
     with pytest.raises(UserError, match=r"4 s apart, too far to follow .* another unit than sec"):
