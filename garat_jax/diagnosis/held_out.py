@@ -121,6 +121,7 @@ def are_explained(error: Errors, longest: Errors | None) -> bool:
 def metric_in_words(problem: Problem, how: str) -> str:
     """Say what the reported errors are; `how` names the recordings."""
     return (
-        "root mean square of prediction error by signal's standard deviation (a signal that hardly "
-        f"moves: by its noise, as a typical other), {how}, segments of {problem.horizon:.2g} s"
+        "root mean square of all signals' prediction errors, each divided by its signal's standard "
+        "deviation (where a signal hardly moves, by as many times its noise as is usual of the "
+        f"others), {how}, segments of {problem.horizon:.2g} s"
     )
