@@ -201,7 +201,8 @@ def aggregate(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     done = [row for row in rows if row["status"] != NOT_YET]
     of = {name: [r for r in done if r["category"] == name] for name in CATEGORIES}
     singles = of["single"]
-    clean = [{**row, "adequate": row.get("verdict") == "adequate"} for row in of["clean"]]
+    known = ("adequate", "missing_effect")  # late commands may be found, which are no secret
+    clean = [{**row, "explained": row.get("verdict") in known} for row in of["clean"]]
     lines = [
         _share("right kind first", singles, "kind_first", 0.95),
         _share("right kind first and past every gate", singles, "kind_claimed", None),
@@ -210,7 +211,7 @@ def aggregate(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         _share("right joint or body", singles, "place_right", 0.95),
         _share("pairs, both found", of["pair"], "ok", 0.85),
         _share("clean, nothing claimed", clean, "ok", 0.95),
-        _share("of these seen to be adequate", clean, "adequate", None),
+        _share("clean, not called unexplained", clean, "explained", None),
         _share("outside, unexplained", of["outside"], "ok", 0.90),
     ]  # fmt: skip
     estimates = [e | {"case": r["case"]} for r in done for e in r.get("estimates", [])]
