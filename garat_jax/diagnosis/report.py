@@ -112,7 +112,8 @@ def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     error, over = diagnosis.decisive, diagnosis.over
     rest = Fact(_percent(error.unexplained_share), "of the error stays unexplained")
     if not diagnosis.selected and error.is_near_floor and error.above_floor:
-        rest = Fact(str(len(error.above_floor)), "signals stay well above their noise floor")
+        num = len(error.above_floor)
+        rest = Fact(str(num), f"{'signal stays' if num == 1 else 'signals stay'} above the noise")
     return [
         Fact(_percent(error.before), f"error of the model as it is{over}, of each signal's spread"),
         Fact(_percent(error.after), f"error{over} with the effects that were found"),
