@@ -112,6 +112,7 @@ class Sighting:
         error_without: Error in this recording, of its signals' spread, without the effect.
         error_with: The same with it.
         ahead: Rivals of the effect that are expected to explain more of this recording.
+        horizon: Seconds that the recording was followed for at a time.
     """
 
     recording: str
@@ -121,6 +122,7 @@ class Sighting:
     error_without: float
     error_with: float
     ahead: tuple[Named, ...]
+    horizon: float
 
     @property
     def is_needed(self) -> bool:

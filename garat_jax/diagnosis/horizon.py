@@ -142,9 +142,11 @@ def cut_longest(
         Segments that are held out, and no other; None where none can be longer.
     """
     held_out = np.unique(problem.segments.recording[~problem.fitted])
-    for longer, growth in _predictable(problem, recordings, grid, theta, held_out):
-        return longer.take(growth <= 1.0)
-    return None
+    longest = next(_predictable(problem, recordings, grid, theta, held_out), None)
+    if longest is None:
+        return None
+    longer, growth = longest
+    return longer.take(growth <= 1.0)
 
 
 def _predictable(

@@ -39,6 +39,11 @@ def has_memory_of_motion(effects: Sequence[Effect], host: mujoco.MjModel) -> boo
     )
 
 
+def lead_steps(grid: Grid) -> int:
+    """Return the control steps of `LEAD_IN`."""
+    return int(np.ceil(LEAD_IN / grid.interval))
+
+
 def way_to(
     start: jax.Array, past: Past, host: mujoco.MjModel, grid: Grid, substeps: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -57,7 +62,7 @@ def way_to(
         Commands [n, nu], positions [n, substeps, nq] and velocities [n, substeps, nv] over
         `LEAD_IN`. Velocities are the measured ones, positions those that lead to the start at them.
     """
-    num_steps = int(np.ceil(LEAD_IN / grid.interval))
+    num_steps = lead_steps(grid)
     steps = past.num_steps - np.arange(num_steps, 0, -1)
     rows = jnp.maximum(steps, 0)
     qvel = jnp.where(steps[:, None] >= 0, past.qvel[past.recording, rows], 0.0)

@@ -144,7 +144,9 @@ def _alone(
             numbers = (fitted.theta[j], fitted.low[place], fitted.high[place])
             estimate, low, high = (float(v) if seen else float("nan") for v in numbers)
             need = needs[simulator.slots[j].effect]
-            sightings[parameter].append(Sighting(recording.name, estimate, low, high, *need))
+            sightings[parameter].append(
+                Sighting(recording.name, estimate, low, high, *need, whole.horizon)
+            )
     return sightings
 
 

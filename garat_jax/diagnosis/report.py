@@ -111,8 +111,7 @@ def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     """Return the numbers of a diagnosis to be seen first."""
     error, over = diagnosis.decisive, diagnosis.over
     rest = Fact(_percent(error.unexplained_share), "of the error stays unexplained")
-    if not diagnosis.selected and error.is_near_floor and error.above_floor:
-        num = len(error.above_floor)
+    if num := len(diagnosis.loud):
         rest = Fact(str(num), f"{'signal stays' if num == 1 else 'signals stay'} above the noise")
     return [
         Fact(_percent(error.before), f"error of the model as it is{over}, of each signal's spread"),

@@ -194,9 +194,12 @@ def repeatability_section(diagnosis: Diagnosis) -> list[Section]:
             )
     columns = ["effect", "parameter", "recording", "estimate", "low", "high"]
     columns += ["error without [%]", "error with [%]", "rivals ahead"]
+    horizons = {s.horizon: None for r, _ in found for s in r.recordings}
+    followed = " or ".join(f"{horizon:.2g}" for horizon in horizons)
     caption = (
-        "Each recording fitted alone, with its 95 % interval; – where it does not show it. Errors "
-        "are of that recording's spread; rivals ahead promise to explain clearly more of it."
+        f"Each recording fitted alone, followed for {followed} s at a time, with its 95 % "
+        "interval; – where it does not show it. Errors are of that recording's spread; rivals "
+        "ahead promise to explain clearly more of it."
     )
     text = "\n".join(lines)
     return [Section("The same in every recording?", text, tables=[Table(columns, rows, caption)])]

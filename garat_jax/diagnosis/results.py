@@ -235,11 +235,16 @@ class Diagnosis:
     @property
     def rest(self) -> str:
         """What stays unexplained, as a clause."""
-        error, over = self.decisive, self.over
-        if not self.selected and error.is_near_floor and error.above_floor:
-            loud = ", ".join(error.above_floor)
-            return f"that of {loud}{over} stays well above its noise floor"
-        return f"{100 * error.unexplained_share:.0f} % of the error{over} stays unexplained"
+        if self.loud:
+            return f"that of {', '.join(self.loud)}{self.over} stays well above its noise floor"
+        share = 100 * self.decisive.unexplained_share
+        return f"{share:.0f} % of the error{self.over} stays unexplained"
+
+    @property
+    def loud(self) -> tuple[str, ...]:
+        """The signals well above their noise floor, where only these tell of a gap."""
+        alone = not self.selected and self.decisive.is_near_floor
+        return self.decisive.above_floor if alone else ()
 
     @property
     def decisive(self) -> Errors:

@@ -16,7 +16,7 @@ import numpy as np
 from garat_jax import dynamics
 from garat_jax.compiler_options import OPTIMISATION_LEVEL
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.past import Past, has_memory_of_motion, way_to
+from garat_jax.diagnosis.past import Past, has_memory_of_motion, lead_steps, way_to
 from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
 from garat_jax.dynamics import Override
 from garat_jax.effects import Effect, Parameter
@@ -309,7 +309,8 @@ class Simulator:
         acting = (effect.as_replayed() for effect in self.with_parameters(theta, chosen))
         return world.replace(effects=(*world.effects, *acting))
 
-    def _begin(self, world: dynamics.Dynamics, start, past):
+    def _begin(self, world: dynamics.Dynamics, start, past, num_before: int):
+        """Return a segment's start, remembering all commands but the last `num_before`."""
         num_position = self.host.nq
         state = dynamics.initial_state(world, start[:num_position], start[num_position:])
         if not any(effect.remembers for effect in world.effects):
@@ -318,7 +319,7 @@ class Simulator:
         def remember(k, state):
             return dynamics.hold(world, state, past.ctrl[past.recording, k], self._substeps)
 
-        return jax.lax.fori_loop(0, past.num_steps - self._warm_up, remember, state)
+        return jax.lax.fori_loop(0, past.num_steps - num_before, remember, state)
 
     def _predict_at_once(self, world, chosen: tuple[int, ...], theta, start, ctrl, place, past):
         """Predict one segment with candidates that do not look at the state."""
@@ -334,7 +335,7 @@ class Simulator:
         return self._trace(world, start, ctrl, place, past, jnp.concatenate([before, between]))
 
     def _trace(self, world: dynamics.Dynamics, start, ctrl, place, past, along):
-        state = self._begin(world, start, past)
+        state = self._begin(world, start, past, self._warm_up)
         states = dynamics.trajectory(world, state, ctrl, self._substeps, self._warm_up, along)
         states = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), state, states)
         sensed = jax.vmap(dynamics.sensed, (None, 0))(world, states)
@@ -349,7 +350,9 @@ class Simulator:
         bend swing for longer than a segment.
         """
         world = self._with(world, chosen, theta)
-        state = self._begin(world, start, past)
+        leads = has_memory_of_motion(world.effects, self.host)
+        num_before = self._warm_up + (lead_steps(self._grid) if leads else 0)
+        state = self._begin(world, start, past, num_before)
 
         def whole(state):
             return jnp.concatenate([state.qpos, state.qvel])
@@ -371,7 +374,7 @@ class Simulator:
             return state, (whole(dynamics.sensed(world, state)), whole(state))
 
         state, _ = jax.lax.scan(hold, state, ctrl[: self._warm_up])
-        if has_memory_of_motion(world.effects, self.host):
+        if leads:
             way = way_to(start, past, self.host, self._grid, self._substeps)
             state, _ = jax.lax.scan(lead, state, way)
         _, paths = jax.lax.scan(advance, state, ctrl[self._warm_up :])

@@ -12,22 +12,25 @@ from flax import struct
 from garat_jax import dynamics
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.past import LEAD_IN
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
-from garat_jax.effects import Effect, QuadraticDrag
+from garat_jax.effects import Effect, JointFlexibility, QuadraticDrag
 from garat_jax.effects.catalogue import load_catalogue
 from tests import models
 
 MINE = Path(__file__).parents[2] / "examples" / "my_effects.py"
 FADE = load_catalogue([MINE])["thermal_fade"]
+GEARED = models.PENDULUM.replace('damping="0.01"', 'armature="0.01"')
 INTERVAL, NUM = 0.004, 2000
 
 
-def recording(seed: int, time: np.ndarray) -> Recording:
+def recording(
+    seed: int, time: np.ndarray, xml: str = models.PENDULUM, effects: tuple[Effect, ...] = ()
+) -> Recording:
     """Return the true motion of a pendulum whose driver warms up, without noise."""
-    model = Model(
-        "model", MINE, MINE, models.spec(models.PENDULUM), effects=(FADE("all", fade=0.5),)
-    )
+    fades = (*effects, FADE("all", fade=0.5))
+    model = Model("model", MINE, MINE, models.spec(xml), effects=fades)
     with jax.enable_x64(True):
         world = model.compile("mujoco")
         held = np.random.default_rng(seed).uniform(-3, 3, NUM)
@@ -61,6 +64,22 @@ def test_a_segment_begins_as_warm_as_its_recording_had_become(drag):
         errors[fade] = np.abs(counted).max(axis=(1, 2))[segments.first > 0]
     assert errors[0.5].max() < 1e-7
     assert errors[0.0].min() > 10 * errors[0.5].max()
+
+
+def test_what_is_led_along_the_motion_does_not_warm_twice():
+    bends = JointFlexibility("joint/hinge", stiffness=2.0, damping=0.1)
+    made = recording(5, np.arange(NUM) * INTERVAL, GEARED, (bends,))
+    model = Model("model", MINE, MINE, models.spec(GEARED), effects=(bends,))
+    grid = choose_grid([made], 0.002)
+    simulator = Simulator(model, (FADE("all", fade=0.0),), grid)
+    segments = cut([made], grid, 0.2)
+    theta = np.asarray([[0.0], [0.45], [0.5], [0.55]])
+    starts = np.broadcast_to(segments.start, (len(theta), *segments.start.shape))
+    predicted = simulator.predict(theta, starts, segments)
+    led = segments.num_past * INTERVAL > LEAD_IN
+    cold, less, right, more = np.square(predicted - segments.measured)[:, led].mean(axis=(1, 2, 3))
+    assert right < 0.01 * cold
+    assert right < min(less, more)
 
 
 def test_past_commands_are_those_on_the_simulated_steps():
