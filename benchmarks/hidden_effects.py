@@ -24,6 +24,7 @@ from typing import Any
 from hidden import score
 from hidden.generate import Case, Surveys, Truth, draw, generate, list_cases, shuffled
 from hidden.robots import ROBOTS
+from jobs import end_with_parent
 from record import RESULTS, command_line, write_result
 
 from garat_jax.diagnosis import diagnose, load_model
@@ -118,11 +119,12 @@ def recorded_rows(seed: int) -> dict[str, dict[str, Any]]:
     return {row["case"]: row for row in rows if row["seed"] == seed and row["status"] == "done"}
 
 
-def _keep_to_own_cores(numbers, jobs: int) -> None:
+def _begin(numbers, jobs: int) -> None:
     """Keep a job to its share of the cores: threads of two jobs that take turns wait for long.
 
     BLAS has made its threads by now, on all cores: `run` sees to it that they are as few.
     """
+    end_with_parent()
     if hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, cores[numbers.get() % len(cores) :: jobs])
@@ -148,7 +150,7 @@ def run(
     for number in range(jobs):
         numbers.put(number)
     with concurrent.futures.ProcessPoolExecutor(
-        jobs, context, initializer=_keep_to_own_cores, initargs=(numbers, jobs)
+        jobs, context, initializer=_begin, initargs=(numbers, jobs)
     ) as pool:
         futures = [pool.submit(run_case, case, robots, limit) for case in todo] if jobs > 1 else []
         made = (

@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from jobs import end_with_parent
 from record import RESULTS, command_line, write_result
 
 from garat_jax import rollout
@@ -226,7 +227,7 @@ def measure(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]]:
         for config in configs(world, arguments.regions)
     ]
     context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(arguments.jobs, mp_context=context) as pool:
+    with concurrent.futures.ProcessPoolExecutor(arguments.jobs, context, end_with_parent) as pool:
         peers = {
             (name, config): [
                 pool.submit(learn_peer, name, config, seed, steps)
