@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, twins
+from garat_jax.diagnosis.contend import Contender, refines, twins
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
 from garat_jax.diagnosis.problem import Problem, block_labels
@@ -58,11 +58,12 @@ def judge(
     if contenders:
         costs = _block_costs(problem, 1.0, [c.fit for c in contenders], slice(None))
         num_blocks = costs.shape[1]
-        penalty = [len(c.fit.free) * np.log(num_blocks) / num_blocks for c in contenders]
+        num_free = np.asarray([len(c.fit.free) for c in contenders])
+        penalty = num_free * np.log(num_blocks) / num_blocks
         criterion = np.log(costs.sum(axis=1)) + penalty
         drawn = np.log(_resamples(num_blocks) @ costs.T) + penalty
         at_floor = [not is_above(problem, metric, c.fit, floor, AT_FLOOR) for c in contenders]
-        alike = _alike(current, contenders, at_floor, drawn)
+        alike = _alike(problem, current, contenders, at_floor, drawn, penalty)
         order = [int(index) for index in np.argsort(criterion)]
         found = {
             i: _judge_one(problem, metric, current, contenders, i, alike, drawn) for i in order
@@ -84,12 +85,26 @@ def judge(
 
 
 def _alike(
-    current: Fit, contenders: Sequence[Contender], at_floor: Sequence[bool], drawn: np.ndarray
+    problem: Problem,
+    current: Fit,
+    contenders: Sequence[Contender],
+    at_floor: Sequence[bool],
+    drawn: np.ndarray,
+    penalty: np.ndarray,
 ) -> list[list[int]]:
     """List for each contender those that these recordings do not tell from it.
 
     They do much the same, and neither leads for certain or both leave no more than noise and the
-    integrator make: what the one explains beyond that is not physics.
+    integrator make: what the one explains beyond that is not physics. That a law has more
+    parameters tells it from one that it refines, and from no other.
+
+    Args:
+        problem: What is fitted.
+        current: The fit of the effects selected so far.
+        contenders: Those that were fitted.
+        at_floor: Which of them leave no more than noise and the integrator make.
+        drawn: Logarithms of their costs in resamples, with the penalty, [RESAMPLES, num].
+        penalty: What each pays for its parameters, [num].
     """
     change = [(c.fit.residual - current.residual).ravel() for c in contenders]
     size = [float(np.linalg.norm(c)) or 1.0 for c in change]
@@ -97,12 +112,21 @@ def _alike(
     def are_alike(one: int, other: int) -> bool:
         same = cosine(contenders[one].score, contenders[other].score)
         same = max(same, abs(float(change[one] @ change[other])) / (size[one] * size[other]))
-        lead = np.quantile(drawn[:, other] - drawn[:, one], [0.025, 0.5, 0.975])
-        close = lead[0] < 0 < lead[2] or abs(lead[1]) < np.log(TOO_CLOSE)
+        owners = contenders[one].score.effect, contenders[other].score.effect
+        are_related = refines(problem, *owners) or refines(problem, *owners[::-1])
+        lead = drawn[:, other] - drawn[:, one]
+        close = _is_close(lead)
+        close |= not are_related and _is_close(lead - penalty[other] + penalty[one])
         return bool(same > EQUIVALENT and (close or (at_floor[one] and at_floor[other])))
 
     every = range(len(contenders))
     return [[j for j in every if j != i and are_alike(i, j)] for i in every]
+
+
+def _is_close(lead: np.ndarray) -> bool:
+    """Say whether a lead, as the logarithm of two costs in resamples, may be none, or is tiny."""
+    low, middle, high = np.quantile(lead, [0.025, 0.5, 0.975])
+    return bool(low < 0 < high or abs(middle) < np.log(TOO_CLOSE))
 
 
 def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, alike, drawn):

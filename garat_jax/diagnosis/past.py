@@ -20,7 +20,7 @@ class Past(NamedTuple):
 
     Attributes:
         ctrl: Command of every simulated step of all recordings, [R, T, nu].
-        qvel: Measured velocity in them, [R, T, nv].
+        qvel: Measured velocity in the middle of each, [R, T, nv].
         recording: Index of each segment's recording, [S].
         num_steps: How many of its steps came before the segment, [S].
     """

@@ -71,6 +71,13 @@ def test_a_simpler_law_that_fails_a_gate_does_not_count(problem):
     assert first.passes and not second.passes
 
 
+def test_more_parameters_do_not_tell_a_law_from_another_that_it_does_not_refine(problem):
+    simple, rich = judged(problem, 2.0, 2.0)
+    assert (simple.effect, rich.effect) == (SIMPLE, RICH)
+    assert [named.effect for named in simple.indistinguishable_from] == [RICH]
+    assert [named.effect for named in rich.indistinguishable_from] == [SIMPLE]
+
+
 def test_an_equal_of_the_best_that_passes_every_gate_comes_first(problem):
     best, equal = judged(problem, 1.75, 2.0)
     assert (best.effect, equal.effect) == (SIMPLE, RICH)
