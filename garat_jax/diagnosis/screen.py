@@ -26,6 +26,8 @@ WORTH_A_REFINEMENT = 0.8
 """Share of what a simpler law leaves unexplained that a refinement of it must get below."""
 SCREENED = 24
 """Segments that are screened at least, evenly chosen; scores take many simulations each."""
+HEAVY = 0.1
+"""Share of all the squared residual from which a segment is screened wherever it lies."""
 VISIBLE = 3.0
 """Whitened change over a parameter's whole range below which the data cannot show it."""
 WORTHWHILE = 0.01
@@ -67,8 +69,7 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
         fit: The current fit.
         skip: Indices of effects that are in the model already.
     """
-    fitted = np.flatnonzero(problem.fitted)
-    chosen = fitted[:: max(1, len(fitted) // SCREENED)]
+    chosen = _screened(problem, fit)
     evidence = Evidence(problem, fit, chosen)
     problem = problem.take(chosen)
     rows, trials, changes = _measure(problem, fit.theta, evidence, skip)
@@ -89,6 +90,17 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
         key=lambda i: (bool(scores[i].excluded), not scores[i].possible, -place[i]),
     )
     return [scores[i] for i in order]
+
+
+def _screened(problem: Problem, fit: Fit) -> np.ndarray:
+    """Choose fitted segments evenly, and those that hold much of the residual.
+
+    An effect that seldom acts, as a limit that is seldom reached, shows in those alone.
+    """
+    fitted = np.flatnonzero(problem.fitted)
+    evenly = fitted[:: max(1, len(fitted) // SCREENED)]
+    cost = fit.cost[fitted]
+    return np.union1d(evenly, fitted[cost > HEAVY * cost.sum()])
 
 
 def simpler_law(problem: Problem, score: Score, scores: Sequence[Score]) -> Score | None:

@@ -18,7 +18,7 @@ from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, metric_spread,
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.timestep import count_timestep
-from garat_jax.effects import ActuatorDelay
+from garat_jax.effects import ActuatorDelay, TorqueSaturation
 from garat_jax.errors import UserError
 from tests import models
 
@@ -235,3 +235,21 @@ def test_noise_of_a_signal_that_hardly_moves_weighs_as_much_as_that_of_others():
     np.testing.assert_array_equal(spread[:2], samples[:, :2].std(axis=0))
     assert spread[2] / noise[2] == pytest.approx(np.median(spread[:2] / noise[:2]))
     np.testing.assert_allclose(metric_spread(samples[:, 2:], noise[2:]), QUIET * noise[2:])
+
+
+def test_a_limit_that_is_reached_in_one_segment_only_is_screened_there():
+    time = np.arange(6000) * 0.004
+    limit = TorqueSaturation("actuator/motor")
+    problem = make_problem([record(time, noise=0.0)], (limit,))
+    segments, noise = problem.segments, 1e-3 * np.array([1.0, 10.0])
+    for alone in (30, 31):  # of 60 segments every second one is screened anyway
+        small = np.where(np.arange(60) == alone, 1.0, 0.3)[:, None, None]
+        commanded = dataclasses.replace(segments, ctrl=small * segments.ctrl, noise=noise)
+        true = problem.simulator.predict(np.array([[0.5]]), segments.start[None], commanded)[0]
+        measured = true + noise * np.random.default_rng(0).normal(size=true.shape)
+        made = dataclasses.replace(commanded, measured=measured)
+        some = dataclasses.replace(problem, segments=made)
+        settled = settle(some, some.simulator.base, made.start)
+        (score,) = screen(some, settled)
+        assert not score.excluded
+        assert score.share > 0.5
