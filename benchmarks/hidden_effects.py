@@ -35,7 +35,7 @@ from garat_jax.provenance import git_state
 from garat_jax.runs import finite_or_null, to_plain
 
 NAME = "hidden_effects"
-"""Of the result file."""
+"""Of the result file of the seed that is reported; those of others have the seed in their names."""
 REPORTING_SEED = 1
 """The seed that is reported; never used to choose a threshold."""
 
@@ -110,9 +110,14 @@ def read_rows(path: Path, commit: str | None) -> dict[str, dict[str, Any]]:
     return {row["case"]: row for row in same}
 
 
+def result_name(seed: int) -> str:
+    """Return the name of a seed's result file."""
+    return NAME if seed == REPORTING_SEED else f"{NAME}_seed_{seed}"
+
+
 def recorded_rows(seed: int) -> dict[str, dict[str, Any]]:
     """Return the rows of the result file that come from this seed, by case."""
-    path = RESULTS / f"{NAME}.json"
+    path = RESULTS / f"{result_name(seed)}.json"
     if not path.exists():
         return {}
     rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
@@ -218,8 +223,8 @@ def main() -> None:
     picked = arguments.only or arguments.robots != list(ROBOTS)
     if not picked and not any(row["status"] == score.NOT_YET for row in rows):
         details = {"cases": num_cases, "sample": len(rows), "table": lines}
-        seeds = [arguments.seed]
-        print(write_result(NAME, rows, seeds=seeds, command=command, details=details))
+        name, seeds = result_name(arguments.seed), [arguments.seed]
+        print(write_result(name, rows, seeds=seeds, command=command, details=details))
 
 
 if __name__ == "__main__":

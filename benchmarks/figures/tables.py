@@ -115,8 +115,8 @@ def optimisation_level() -> str:
     return table(columns, rows) + origin("optimisation_level", result)
 
 
-def hidden_effects() -> str:
-    return if_measured(_hidden_effects, "hidden_effects")
+def hidden_effects(name: str = "hidden_effects") -> str:
+    return if_measured(_hidden_effects, name)
 
 
 def _hidden_effects(result: dict[str, Any]) -> str:
@@ -292,6 +292,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "fidelity": fidelity,
     "optimisation_level": optimisation_level,
     "hidden_effects": hidden_effects,
+    "hidden_effects_seed_3": lambda: hidden_effects("hidden_effects_seed_3"),
     "timing": timing,
     "real_data": real_data,
     "ground": ground,
