@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from garat_jax.diagnosis.units import after_number
 
@@ -98,6 +98,14 @@ class Candidate:
     def sizes(self) -> str:
         """The parameters with their intervals and units."""
         return ", ".join(f"{name} {value}" for name, value in self.parameters.items())
+
+    def with_alike(self, name: Callable[[Named], str] = str) -> str:
+        """Name the effect, and those that the recordings cannot tell from it, by `name`."""
+        alike = [name(other) for other in self.indistinguishable_from]
+        if not alike:
+            return name(self.named)
+        others = " or ".join(alike) if len(alike) < 3 else f"one of {len(alike)} others"
+        return f"{name(self.named)} (or {others}: these recordings cannot tell)"
 
 
 @dataclasses.dataclass(frozen=True)

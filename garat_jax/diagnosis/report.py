@@ -80,7 +80,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
     error, over = diagnosis.decisive, diagnosis.over
     if error.is_too_coarse:
         return error.coarseness
-    names = " and ".join(_label_with_alike(c) for c in diagnosis.selected)
+    names = " and ".join(c.with_alike(label) for c in diagnosis.selected)
     floor = f"noise alone makes {_percent(error.noise_floor)}"
     if diagnosis.verdict == "adequate":
         return (
@@ -96,15 +96,6 @@ def _verdict(diagnosis: Diagnosis) -> str:
     if names:
         return f"The model lacks {names}, but that is not all. With it, {fall}: {diagnosis.rest}."
     return f"Something is missing that no effect in the catalogue explains: {diagnosis.rest}."
-
-
-def _label_with_alike(candidate: Candidate) -> str:
-    """Name an effect, and the others that these recordings cannot tell from it."""
-    alike = [label(other) for other in candidate.indistinguishable_from]
-    if not alike:
-        return label(candidate)
-    others = " or ".join(alike) if len(alike) < 3 else f"one of {len(alike)} others"
-    return f"{label(candidate)} (or {others}: these recordings cannot tell)"
 
 
 def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:

@@ -218,18 +218,18 @@ class Diagnosis:
         error, over = self.decisive, self.over
         if error.is_too_coarse:
             return error.coarseness
-        fall = f"held-out error{over} {error.before:.3g} → {error.after:.3g}"
         floor = f"{error.noise_floor:.3g}"
+        fall = f"held-out error{over} {error.before:.3g} → {error.after:.3g}, noise floor {floor}"
         if self.verdict == "adequate":
             return (
                 f"The model is adequate: its held-out error {error.before:.3g} is near the noise "
                 f"floor {floor}{self.blindness}."
             )
-        names = " and ".join(str(c.named) for c in self.selected)
+        names = " and ".join(c.with_alike() for c in self.selected)
         if self.verdict == "missing_effect":
-            return f"Missing: {names} ({fall}, noise floor {floor})."
+            return f"Missing: {names}; {fall}."
         if names:
-            return f"Found {names} ({fall}, noise floor {floor}), but {self.rest}."
+            return f"Found {names}; {fall}; but {self.rest}."
         return f"Nothing in the catalogue explains the error: {self.rest}."
 
     @property

@@ -110,8 +110,9 @@ def write(tmp_path, diagnosis) -> str:
 
 def test_a_gap_that_shows_over_long_segments_alone_is_said_with_their_length():
     assert NOT_ALL.sentence == (
-        "Found coulomb_friction at joint/hinge (held-out error over 2 s 0.9 → 0.09, noise floor "
-        "0.01), but 10 % of the error over 2 s stays unexplained."
+        "Found coulomb_friction at joint/hinge (or viscous_damping at joint/hinge: these "
+        "recordings cannot tell); held-out error over 2 s 0.9 → 0.09, noise floor 0.01; but 10 % "
+        "of the error over 2 s stays unexplained."
     )
     assert diagnosis_lead(NOT_ALL).endswith(": 10 % of the error over 2 s stays unexplained.")
     assert [fact.value for fact in diagnosis_facts(NOT_ALL)] == ["90 %", "9 %", "1 %", "10 %"]
