@@ -1,6 +1,7 @@
 """Score a diagnosis against what was hidden, and add the scores up beside what they are held to."""
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -112,8 +113,9 @@ def score(found: Diagnosis, truth: Truth, model: mujoco.MjModel) -> dict[str, An
     ]
     row["estimates"] = estimates
     if category == "pair":
-        seen = [any(finds(c, s, model) for c in selected) for s in truth.secrets]
-        return row | {"found": seen, "ok": all(seen)}
+        finders = [[i for i, c in enumerate(selected) if finds(c, s, model)] for s in truth.secrets]
+        each = any(len({*chosen}) == len(chosen) for chosen in itertools.product(*finders))
+        return row | {"found": [bool(some) for some in finders], "ok": each}
     secret = truth.secrets[0]
     kind = first is not None and names_kind(first, secret)
     at = first is not None and names_place(first, secret, model)

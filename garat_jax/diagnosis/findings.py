@@ -108,6 +108,17 @@ class Candidate:
         return f"{name(self.named)} (or {others}: these recordings cannot tell)"
 
 
+def apart(selected: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Return effects that were found, none of them named as what another is not told from."""
+    taken = {c.named for c in selected}
+    return tuple(
+        dataclasses.replace(
+            c, indistinguishable_from=tuple(n for n in c.indistinguishable_from if n not in taken)
+        )
+        for c in selected
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class Sighting:
     """What one recording alone shows of a parameter, and of the effect that it belongs to.

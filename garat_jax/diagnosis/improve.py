@@ -14,7 +14,7 @@ from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.conditions import add_conditions, read_conditions, write_cards
 from garat_jax.diagnosis.diagnose import diagnose, split, thin
 from garat_jax.diagnosis.export import copy_model, needed_files
-from garat_jax.diagnosis.findings import Candidate
+from garat_jax.diagnosis.findings import Candidate, apart
 from garat_jax.diagnosis.held_out import are_explained, errors_of, longest_errors
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
@@ -142,7 +142,7 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
         verdict=verdict,
         error=error,
         longest=longest,
-        selected=added,
+        selected=apart(added),
         ladder=ladder,
         left=last.left if stays else (),
         next_experiment=last.next_experiment or first.next_experiment,

@@ -96,7 +96,7 @@ def _alike(
 
     They do much the same, and neither leads for certain or both leave no more than noise and the
     integrator make: what the one explains beyond that is not physics. That a law has more
-    parameters tells it from one that it refines, and from no other.
+    parameters may tell it from one that it refines, and from no other.
 
     Args:
         problem: What is fitted.
@@ -114,19 +114,14 @@ def _alike(
         same = max(same, abs(float(change[one] @ change[other])) / (size[one] * size[other]))
         owners = contenders[one].score.effect, contenders[other].score.effect
         are_related = refines(problem, *owners) or refines(problem, *owners[::-1])
-        lead = drawn[:, other] - drawn[:, one]
-        close = _is_close(lead)
-        close |= not are_related and _is_close(lead - penalty[other] + penalty[one])
+        paid = [0.0] if are_related else [0.0, penalty[other] - penalty[one]]
+        leads = (drawn[:, other] - drawn[:, one])[:, None] - paid
+        low, middle, high = np.quantile(leads, [0.025, 0.5, 0.975], axis=0)
+        close = low.min() < 0 < high.max() or np.abs(middle).min() < np.log(TOO_CLOSE)
         return bool(same > EQUIVALENT and (close or (at_floor[one] and at_floor[other])))
 
     every = range(len(contenders))
     return [[j for j in every if j != i and are_alike(i, j)] for i in every]
-
-
-def _is_close(lead: np.ndarray) -> bool:
-    """Say whether a lead, as the logarithm of two costs in resamples, may be none, or is tiny."""
-    low, middle, high = np.quantile(lead, [0.025, 0.5, 0.975])
-    return bool(low < 0 < high or abs(middle) < np.log(TOO_CLOSE))
 
 
 def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, alike, drawn):

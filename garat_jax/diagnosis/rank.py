@@ -21,7 +21,7 @@ from garat_jax.diagnosis.contend import (
     with_evidence,
     with_twins,
 )
-from garat_jax.diagnosis.findings import Candidate, Named
+from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import (
     ANOTHER_MAY_HELP,
@@ -166,7 +166,8 @@ def explain(
         current = settle_twice(problem, found.timeless or count_timestep(problem, current))
         steps[-1] = steps[-1]._replace(fit=current)
     shown = _as_shown(problem, steps, current)
-    selected = tuple(shown[step.candidate.named] for step in steps)
+    selected = apart([shown[step.candidate.named] for step in steps])
+    shown |= {c.named: c for c in selected}
     candidates = tuple(shown.get(c.named, c) for c in candidates)
     best = current if steps else found.best
     if not is_above(problem, make_metric(problem), current, found.floor):

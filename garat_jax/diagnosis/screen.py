@@ -69,11 +69,12 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
         fit: The current fit.
         skip: Indices of effects that are in the model already.
     """
-    chosen = _screened(problem, fit)
+    chosen, weight = _screened(problem, fit)
     evidence = Evidence(problem, fit, chosen)
     problem = problem.take(chosen)
-    rows, trials, changes = _measure(problem, fit.theta, evidence, skip)
-    raw = [_score(problem, evidence, changes, rows, trial) for trial in trials]
+    weight = np.repeat(weight, len(evidence.residual) // len(chosen))
+    rows, trials, changes = _measure(problem, fit.theta, evidence, weight, skip)
+    raw = [_score(problem, evidence, weight, changes, rows, trial) for trial in trials]
     judged = [score for score in raw if not score.excluded]
     order = np.argsort([score.p_value for score in judged])
     adjusted, largest = {}, 0.0
@@ -92,15 +93,20 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
     return [scores[i] for i in order]
 
 
-def _screened(problem: Problem, fit: Fit) -> np.ndarray:
+def _screened(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Choose fitted segments evenly, and those that hold much of the residual.
 
-    An effect that seldom acts, as a limit that is seldom reached, shows in those alone.
+    An effect that seldom acts, as a limit that is seldom reached, shows in those alone. Each of the
+    others stands for several.
+
+    Returns:
+        Their indices, and the weights of their residuals, each [C].
     """
     fitted = np.flatnonzero(problem.fitted)
-    evenly = fitted[:: max(1, len(fitted) // SCREENED)]
-    cost = fit.cost[fitted]
-    return np.union1d(evenly, fitted[cost > HEAVY * cost.sum()])
+    is_heavy = fit.cost > HEAVY * fit.cost[fitted].sum()
+    chosen = np.union1d(fitted[:: max(1, len(fitted) // SCREENED)], fitted[is_heavy[fitted]])
+    light = np.count_nonzero(~is_heavy[chosen]) / max(np.count_nonzero(~is_heavy[fitted]), 1)
+    return chosen, np.where(is_heavy[chosen], np.sqrt(light), 1.0)
 
 
 def simpler_law(problem: Problem, score: Score, scores: Sequence[Score]) -> Score | None:
@@ -120,7 +126,9 @@ def cosine(a: Score, b: Score) -> float:
     return float(abs(a.contribution @ b.contribution) / size) if size > 0 else 0.0
 
 
-def _measure(problem: Problem[Simulator], theta: np.ndarray, evidence: Evidence, skip):
+def _measure(
+    problem: Problem[Simulator], theta: np.ndarray, evidence: Evidence, weight: np.ndarray, skip
+):
     """Simulate the candidates at all their sizes, then the other parameters of the best size.
 
     Returns:
@@ -146,7 +154,8 @@ def _measure(problem: Problem[Simulator], theta: np.ndarray, evidence: Evidence,
             if is_other:
                 rows[index], trials[index], changes[:, index] = row, trial, new
     num_firsts = len(rows)
-    rows, trials = others(simulator, theta, rows, best_sizes(trials, changes, residual))
+    best = best_sizes(trials, weight[:, None] * changes, weight * residual)
+    rows, trials = others(simulator, theta, rows, best)
     if more := rows[num_firsts:]:
         below = [changes[:, row.below] if row.below >= 0 else 0.0 * residual for row in more]
         changes = np.concatenate([changes, change(more) - np.stack(below, axis=1)], axis=1)
@@ -154,9 +163,14 @@ def _measure(problem: Problem[Simulator], theta: np.ndarray, evidence: Evidence,
 
 
 def _score(
-    problem: Problem, evidence: Evidence, changes: np.ndarray, rows: list[Row], trial: Trial
+    problem: Problem,
+    evidence: Evidence,
+    weight: np.ndarray,
+    changes: np.ndarray,
+    rows: list[Row],
+    trial: Trial,
 ) -> Score:
-    """Judge one candidate at one size."""
+    """Judge one candidate at one size; `weight` [M] is that of the residuals."""
     chosen, residual = list(trial.rows), evidence.residual
     slots = [problem.simulator.slots[rows[i].column].parameter for i in chosen]
     matrix = changes[:, chosen]
@@ -172,10 +186,11 @@ def _score(
         reason = f"the recordings do not excite it: no signal depends on its {unseen[0]}"
         columns = tuple(rows[i].column for i in chosen)
         return Score(trial.effect, columns, (), {}, 0.0, 1.0, False, matrix[:, 0], reason)
-    needed = _needed(matrix, residual, seen, given)
-    chosen, matrix = [chosen[i] for i in needed], matrix[:, needed]
-    factor = np.linalg.lstsq(matrix, -residual, rcond=1e-6)[0]
-    contribution = matrix @ factor
+    residual, weighted = weight * residual, weight[:, None] * matrix
+    needed = _needed(weighted, residual, seen, given)
+    chosen, matrix, weighted = [chosen[i] for i in needed], matrix[:, needed], weighted[:, needed]
+    factor = np.linalg.lstsq(weighted, -residual, rcond=1e-6)[0]
+    contribution = weighted @ factor
     total = float(residual @ residual)
     share = 1.0 - float(np.sum((residual + contribution) ** 2)) / total if total > 0 else 0.0
     size, start, possible = _size(problem.simulator, rows, trial, chosen, factor)

@@ -54,7 +54,7 @@ class Segments:
         first: Index of the first sample within its recording, [S].
         past: Command of every simulated step of each recording from where it begins, padded,
             [R, T, nu].
-        past_qvel: Mean measured velocity in each of these steps, 0 in gaps, [R, T, nv].
+        past_qvel: Measured velocity in the middle of each of these steps, 0 in gaps, [R, T, nv].
         num_past: How many of these steps came before the segment, [S].
         noise: Standard deviation of each signal's noise, [num_signals].
         spread: Standard deviation of each signal, `QUIET` times its noise at least, [num_signals].

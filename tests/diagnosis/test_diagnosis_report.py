@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis import Diagnosis, Recording, figures, load_model
-from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
+from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named, apart
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import Place
@@ -106,6 +106,13 @@ def write(tmp_path, diagnosis) -> str:
         run, diagnosis, model.name, diagnosis_sections(diagnosis, model, fit, holdout)
     ).read_text(encoding="utf-8")
     return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_what_was_found_too_is_not_named_as_an_equal():
+    equal = dataclasses.replace(FRICTION, effect="viscous_damping", indistinguishable_from=())
+    both = dataclasses.replace(MISSING, selected=apart([FRICTION, equal]))
+    found = "coulomb_friction at joint/hinge and viscous_damping at joint/hinge"
+    assert both.sentence.startswith(f"Missing: {found};")
 
 
 def test_a_gap_that_shows_over_long_segments_alone_is_said_with_their_length():

@@ -18,7 +18,7 @@ from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, metric_spread,
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.timestep import count_timestep
-from garat_jax.effects import ActuatorDelay, TorqueSaturation
+from garat_jax.effects import ActuatorDelay, TorqueSaturation, ViscousDamping
 from garat_jax.errors import UserError
 from tests import models
 
@@ -253,3 +253,20 @@ def test_a_limit_that_is_reached_in_one_segment_only_is_screened_there():
         (score,) = screen(some, settled)
         assert not score.excluded
         assert score.share > 0.5
+
+
+def test_a_segment_with_much_of_the_residual_counts_as_one_beside_those_not_screened():
+    time = np.arange(24000) * 0.004
+    made = record(time, damping=0.02)
+    problem = make_problem([made], (ViscousDamping("joint/hinge", coefficient=0.0),))
+    segments = problem.segments
+    rest = settle(problem, problem.simulator.base, segments.start).cost.sum()
+    wave = np.sin(np.arange(100) * 0.3)
+    measured = segments.measured.copy()  # of 240 segments every tenth is screened anyway
+    measured[3, :, 0] += segments.noise[0] * np.sqrt(0.4 * rest / np.sum(wave**2)) * wave
+    bumped = dataclasses.replace(problem, segments=dataclasses.replace(segments, measured=measured))
+    settled = settle(bumped, bumped.simulator.base, segments.start)
+    bump = settled.cost[3] / settled.cost.sum()
+    (score,) = screen(bumped, settled)
+    assert bump > 0.2
+    assert abs(score.share - (1.0 - bump)) < 0.1
