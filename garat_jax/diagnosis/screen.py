@@ -105,8 +105,8 @@ def _screened(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     fitted = np.flatnonzero(problem.fitted)
     is_heavy = fit.cost > HEAVY * fit.cost[fitted].sum()
     chosen = np.union1d(fitted[:: max(1, len(fitted) // SCREENED)], fitted[is_heavy[fitted]])
-    light = np.count_nonzero(~is_heavy[chosen]) / max(np.count_nonzero(~is_heavy[fitted]), 1)
-    return chosen, np.where(is_heavy[chosen], np.sqrt(light), 1.0)
+    light, of = (np.count_nonzero(~is_heavy[some]) for some in (chosen, fitted))
+    return chosen, np.where(is_heavy[chosen] & (light > 0), np.sqrt(light / max(of, 1)), 1.0)
 
 
 def simpler_law(problem: Problem, score: Score, scores: Sequence[Score]) -> Score | None:

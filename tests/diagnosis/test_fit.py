@@ -270,3 +270,14 @@ def test_a_segment_with_much_of_the_residual_counts_as_one_beside_those_not_scre
     (score,) = screen(bumped, settled)
     assert bump > 0.2
     assert abs(score.share - (1.0 - bump)) < 0.1
+
+
+def test_few_segments_that_all_hold_much_of_the_residual_count_alike():
+    problem = make_problem(
+        [record(UNIFORM, damping=0.02)], (ViscousDamping("joint/hinge", coefficient=0.0),)
+    )
+    settled = settle(problem, problem.simulator.base, problem.segments.start)
+    heavy = np.flatnonzero(settled.cost > 0.1 * settled.cost.sum())
+    assert len(heavy) > 1
+    (score,) = screen(problem.take(heavy), settled.take(heavy))
+    assert score.share > 0.9
