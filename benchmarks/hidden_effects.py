@@ -1,10 +1,11 @@
 """Hide effects in seven robots and see what the diagnosis finds; or time it beside mujoco.sysid.
 
 `python benchmarks/hidden_effects.py --seed 1` makes the numbers that are reported. Thresholds are
-tuned on seed 0. Rows are appended to OUT/rows.jsonl as they come, so an interrupted run goes on.
-`--sample N` diagnoses the first N sets of a random order; the result says of how many, and a larger
-sample with `--extend` keeps what the result file has. A set that takes longer than `--limit` counts
-as wrong. A run of hand-picked cases writes no result.
+tuned on seed 0; every other seed has a result file of its own. Rows are appended to OUT/rows.jsonl
+as they come, so an interrupted run goes on. `--sample N` diagnoses the first N sets of a random
+order; the result says of how many, and a larger sample with `--extend` keeps what the result file
+has. A set that takes longer than `--limit` counts as wrong. A run of hand-picked cases writes no
+result.
 `--timing` needs `pip install 'mujoco[sysid]'`.
 """
 
@@ -125,9 +126,10 @@ def recorded_rows(seed: int) -> dict[str, dict[str, Any]]:
 
 
 def _begin(numbers, jobs: int) -> None:
-    """Keep a job to its share of the cores: threads of two jobs that take turns wait for long.
+    """Let a job end with this process, and keep it to its share of the cores.
 
-    BLAS has made its threads by now, on all cores: `run` sees to it that they are as few.
+    Threads of two jobs that take turns wait for long. BLAS has made its threads by now, on
+    all cores: `run` sees to it that they are as few.
     """
     end_with_parent()
     if hasattr(os, "sched_setaffinity"):
