@@ -106,22 +106,26 @@ def _alike(
         drawn: Logarithms of their costs in resamples, with the penalty, [RESAMPLES, num].
         penalty: What each pays for its parameters, [num].
     """
-    change = [(c.fit.residual - current.residual).ravel() for c in contenders]
-    size = [float(np.linalg.norm(c)) or 1.0 for c in change]
 
     def are_alike(one: int, other: int) -> bool:
-        same = cosine(contenders[one].score, contenders[other].score)
-        same = max(same, abs(float(change[one] @ change[other])) / (size[one] * size[other]))
+        same = do_the_same(current, contenders[one], contenders[other])
         owners = contenders[one].score.effect, contenders[other].score.effect
         are_related = refines(problem, *owners) or refines(problem, *owners[::-1])
         paid = [0.0] if are_related else [0.0, penalty[other] - penalty[one]]
         leads = (drawn[:, other] - drawn[:, one])[:, None] - paid
         low, middle, high = np.quantile(leads, [0.025, 0.5, 0.975], axis=0)
         close = low.min() < 0 < high.max() or np.abs(middle).min() < np.log(TOO_CLOSE)
-        return bool(same > EQUIVALENT and (close or (at_floor[one] and at_floor[other])))
+        return bool(same and (close or (at_floor[one] and at_floor[other])))
 
     every = range(len(contenders))
     return [[j for j in every if j != i and are_alike(i, j)] for i in every]
+
+
+def do_the_same(current: Fit, one: Contender, other: Contender) -> bool:
+    """Say whether two contenders do much the same, as screened or as fitted, to a current fit."""
+    a, b = ((c.fit.residual - current.residual).ravel() for c in (one, other))
+    size = float(np.linalg.norm(a) * np.linalg.norm(b)) or 1.0
+    return bool(max(cosine(one.score, other.score), abs(a @ b) / size) > EQUIVALENT)
 
 
 def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, alike, drawn):

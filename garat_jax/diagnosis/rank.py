@@ -26,13 +26,13 @@ from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import (
     ANOTHER_MAY_HELP,
     Judged,
+    do_the_same,
     estimates,
     held_out_gain,
     judge,
     leads,
 )
 from garat_jax.diagnosis.metric import (
-    AT_FLOOR,
     Floor,
     Metric,
     is_above,
@@ -44,7 +44,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rivals import fill_out, refine
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import Fit, settle, settle_twice
-from garat_jax.diagnosis.steps import Step, prune, refitted, swap
+from garat_jax.diagnosis.steps import Step, prune, reconsider, refitted
 from garat_jax.diagnosis.timestep import count_timestep
 
 RIVALS = 2
@@ -223,8 +223,8 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         steps[-1] = steps[-1]._replace(fit=current)
         steps, current = prune(problem, steps, current, steps[:-1], say)
         floor = noise_floor(problem, metric, current)
-        if is_above(problem, metric, current, floor, AT_FLOOR):
-            steps, current = swap(problem, steps, current, say)
+        if len(steps) > 1:
+            steps, current = reconsider(problem, metric, steps, current, say)
             floor = noise_floor(problem, metric, current)
         if is_refined:
             steps = refitted(problem, steps, current)
@@ -275,7 +275,7 @@ def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, 
         and what is to be added: the first if it passes, with the other if it needs that.
     """
     if not judged or judged[0][0].why not in ANOTHER_MAY_HELP:
-        return judged, _first_step(judged)
+        return judged, _first_step(judged, current)
     first = judged[0][0]
     rivals = [(c, k) for c, k in judged if k and c.named not in first.indistinguishable_from]
     paths = []
@@ -295,16 +295,16 @@ def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, 
     passed = dataclasses.replace(best.candidate, passes=True, why=why)
     rest = [pair for pair in judged if pair[1] is not best.contender]
     judged = [(passed, best.contender), *rest]
-    return judged, [*_first_step(judged), *_first_step(best.then)]
+    return judged, [*_first_step(judged, current), *_first_step(best.then, best.contender.fit)]
 
 
-def _first_step(judged: Judged) -> list[Step]:
-    """Return a round's first candidate as a step, if it passes."""
+def _first_step(judged: Judged, current: Fit) -> list[Step]:
+    """Return a round's first candidate as a step from the fit before it, if it passes."""
     steps = []
     for first, contender in judged[:1]:
         if first.passes and contender:
             others = [(c, k) for c, k in judged[1:] if k]
-            alike = [pair for pair in others if pair[0].named in first.indistinguishable_from]
+            alike = [(c, k) for c, k in others if do_the_same(current, contender, k)]
             steps.append(Step(first, contender, contender.fit, alike))
     return steps
 

@@ -13,6 +13,7 @@ from garat_jax.diagnosis.contend import Contender, as_refined, complete, refines
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import leads
+from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, noise_floor
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.simulate import columns_of
 from garat_jax.diagnosis.starts import Fit
@@ -25,7 +26,7 @@ class Step(NamedTuple):
         candidate: What was said of it.
         contender: How it was fitted then.
         fit: The fit with it and those before it.
-        alike: What the recordings could not tell from it then.
+        alike: What did much the same then, whether the recordings told it from this or not.
     """
 
     candidate: Candidate
@@ -86,50 +87,68 @@ def refitted(problem: Problem, steps: list[Step], current: Fit) -> list[Step]:
     return [step._replace(fit=f) for step, f in zip(steps, (*fits, current), strict=True)]
 
 
-def swap(problem: Problem, steps: list[Step], current: Fit, say):
-    """Put effects in the place of those that they were like, where they fit better by now.
+def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit, say):
+    """Hold effects once more against what did much the same, beside all that was found since.
 
-    What recordings cannot tell from an effect by itself they may tell beside another, and what was
-    added since may only have made up for the wrong one.
+    By itself an effect may lead for what it says of another, which was missing yet; beside that
+    one, recordings may tell apart what they could not, and may no longer what they did. One that
+    fits better by now comes in its place, and what was added since may only have made up for the
+    wrong one.
 
     Returns:
-        The steps and the fit with all of them.
+        The steps, each with those that the recordings do not tell from it now, and the fit with
+        all of them.
     """
-    found, fitted = steps, current
+    found, fitted = [*steps], current
     for place, step in enumerate(steps[:-1]):
         others = [s.effect for s in found if s.effect != step.effect]
-        better: list[tuple[Candidate, Contender]] = []
+        trials = []
         for candidate, contender in step.alike:
-            if contender.score.effect in others:
-                continue
-            say(f"trying {candidate.named} instead of {step.candidate.named}")
-            trial = _fit_instead(problem, fitted, others, contender)
-            if _is_better(problem, trial, fitted):
-                better.append((candidate, dataclasses.replace(contender, fit=trial)))
-        if better:
-            candidate, contender = min(better, key=lambda pair: pair[1].fit.cost.sum())
-            contender = complete(problem, contender, say)
-            rest = [pair for pair in step.alike if pair[0] is not candidate]
-            alike = [(step.candidate, step.contender), *rest]
-            instead = Step(_instead_of(step.candidate, candidate), contender, contender.fit, alike)
-            found, fitted = [*found[:place], instead, *found[place + 1 :]], contender.fit
+            if contender.score.effect not in others:
+                say(f"trying {candidate.named} instead of {step.candidate.named}")
+                trial = _fit_instead(problem, fitted, others, contender)
+                trials.append((candidate, dataclasses.replace(contender, fit=trial)))
+        found[place], fitted = _best_of(problem, metric, step, fitted, trials, say)
     if fitted is current:
-        return steps, current
+        return found, current
     kept, fitted = prune(problem, found, fitted, found, say)
     return (refitted(problem, kept, fitted) if len(kept) == len(found) else kept), fitted
+
+
+def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, say):
+    """Return a step, or what is certainly better in its place, with its equals, and the fit."""
+    better = [pair for pair in trials if _is_better(problem, pair[1].fit, fitted)]
+    if better:
+        best = min(better, key=lambda pair: pair[1].fit.cost.sum())
+        instead = complete(problem, best[1], say)
+        trials = [pair for pair in trials if pair is not best]
+        trials.append((step.candidate, dataclasses.replace(step.contender, fit=fitted)))
+        alike = [(step.candidate, step.contender)]
+        alike += [pair for pair in step.alike if pair[0] is not best[0]]
+        why = f"fits better than {step.candidate.named} beside what was found since"
+        candidate = dataclasses.replace(best[0], passes=True, why=why)
+        step, fitted = Step(candidate, instead, instead.fit, alike), instead.fit
+    floor = noise_floor(problem, metric, fitted)
+    equals = [
+        candidate.named
+        for candidate, contender in trials
+        if _is_equal(problem, metric, floor, fitted, contender.fit)
+    ]
+    candidate = dataclasses.replace(step.candidate, indistinguishable_from=tuple(equals))
+    return step._replace(candidate=candidate), fitted
+
+
+def _is_equal(problem: Problem, metric: Metric, floor: Floor, fitted: Fit, other: Fit) -> bool:
+    """Say whether a fit does not lead another, or both leave no more than noise."""
+    both = (fitted, other)
+    at_floor = not any(is_above(problem, metric, one, floor, AT_FLOOR) for one in both)
+    return at_floor or not leads(problem, fitted, other)
 
 
 def _is_better(problem: Problem, new: Fit, old: Fit) -> bool:
     """Say whether a fit is certainly better than another, and no worse on what is held out."""
     held_out = ~problem.fitted
     return leads(problem, new, old) and new.cost[held_out].sum() <= old.cost[held_out].sum()
-
-
-def _instead_of(old: Candidate, new: Candidate) -> Candidate:
-    """Return a candidate that passes because another, which it was like, fits worse by now."""
-    alike = tuple(named for named in new.indistinguishable_from if named != old.named)
-    why = f"fits better than {old.named} beside what was found since"
-    return dataclasses.replace(new, indistinguishable_from=alike, passes=True, why=why)
 
 
 def _fit_instead(problem: Problem, current: Fit, others: Sequence[int], instead: Contender) -> Fit:

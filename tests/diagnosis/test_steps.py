@@ -9,14 +9,16 @@ from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Candidate, Interval, Named
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon
+from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
-from garat_jax.diagnosis.steps import Step, prune, swap
+from garat_jax.diagnosis.steps import Step, prune, reconsider
 from garat_jax.effects import (
     AsymmetricFriction,
+    BackEmf,
     MotorGain,
     QuadraticDrag,
     TorqueOffset,
@@ -25,8 +27,15 @@ from garat_jax.effects import (
 from tests.diagnosis.pendulum import MODEL, add_damping, record
 
 AT = "joint/hinge"
-EFFECTS = (QuadraticDrag(AT), ViscousDamping(AT), TorqueOffset(AT), MotorGain("actuator/motor"))
-DRAG, DAMPING, OFFSET, GAIN = range(4)
+MOTOR = "actuator/motor"
+EFFECTS = (
+    QuadraticDrag(AT),
+    ViscousDamping(AT),
+    TorqueOffset(AT),
+    MotorGain(MOTOR),
+    BackEmf(MOTOR),
+)
+DRAG, DAMPING, OFFSET, GAIN, EMF = range(5)
 DAMPED = 0.05  # N m s/rad
 
 
@@ -37,7 +46,7 @@ def problem() -> Problem[Simulator]:
     grid = choose_grid(recordings, 0.002)
     coarse, finer = (Simulator(MODEL, EFFECTS, grid, refine) for refine in (1, 2))
     _, segments = choose_horizon(coarse, recordings, grid)
-    return Problem(coarse, finer, segments, np.ones(len(segments.start), bool), 0.004)
+    return Problem(coarse, finer, segments, segments.recording == 0, 0.004)
 
 
 def fit_with(problem: Problem, *effects: int):
@@ -47,9 +56,9 @@ def fit_with(problem: Problem, *effects: int):
 
 def candidate(effect: int, *alike: int) -> Candidate:
     nan = float("nan")
-    named = tuple(Named(EFFECTS[i].kind, AT) for i in alike)
-    gain = Interval(nan, nan, nan)
-    return Candidate(EFFECTS[effect].kind, AT, {}, 0.5, 0.0, nan, gain, 1.0, named, True, "")
+    named = tuple(Named(EFFECTS[i].kind, EFFECTS[i].target) for i in alike)
+    gain, added = Interval(nan, nan, nan), EFFECTS[effect]
+    return Candidate(added.kind, added.target, {}, 0.5, 0.0, nan, gain, 1.0, named, True, "")
 
 
 def contender(problem: Problem, effect: int) -> Contender:
@@ -57,20 +66,29 @@ def contender(problem: Problem, effect: int) -> Contender:
     return Contender(score, fit_with(problem, effect))
 
 
-def swapped(problem: Problem, first: int, other: int, *later: int):
-    """Add an effect that was like another, then more; return what becomes of them."""
-    alike = [(candidate(other, first), contender(problem, other))]
+def reconsidered(problem: Problem, first: int, other: int, *later: int, named: bool = True):
+    """Add an effect that did much what another does, then more; return what becomes of them.
+
+    Args:
+        problem: What is fitted.
+        first: What was added.
+        other: What did much the same.
+        later: What was added since.
+        named: Whether the recordings could not tell the two apart then.
+    """
+    alike = [(candidate(other), contender(problem, other))]
     own = contender(problem, first)
-    steps, added = [Step(candidate(first, other), own, own.fit, alike)], [first]
+    steps, added = [Step(candidate(first, *[other][:named]), own, own.fit, alike)], [first]
     for effect in later:
         added.append(effect)
         fitted = fit_with(problem, *added)
         steps.append(Step(candidate(effect), contender(problem, effect), fitted, []))
-    return *swap(problem, steps, steps[-1].fit, lambda line: None), steps[-1].fit
+    metric, before = make_metric(problem), steps[-1].fit
+    return *reconsider(problem, metric, steps, before, lambda line: None), before
 
 
 def test_an_effect_gives_way_to_one_that_it_was_like_and_that_fits_better_by_now(problem):
-    steps, current, before = swapped(problem, DRAG, DAMPING, OFFSET)
+    steps, current, before = reconsidered(problem, DRAG, DAMPING, OFFSET)
     assert [step.effect for step in steps] == [DAMPING, OFFSET]
     assert steps[0].candidate.named == Named("viscous_damping", AT)
     assert steps[0].candidate.passes
@@ -82,17 +100,25 @@ def test_an_effect_gives_way_to_one_that_it_was_like_and_that_fits_better_by_now
 
 
 def test_what_only_made_up_for_the_wrong_effect_goes_with_it(problem):
-    steps, current, before = swapped(problem, DRAG, DAMPING, OFFSET, GAIN)
+    steps, current, before = reconsidered(problem, DRAG, DAMPING, OFFSET, GAIN)
     assert [step.effect for step in steps] == [DAMPING, OFFSET]
     assert current.cost.sum() < 0.9 * before.cost.sum()
     assert current.theta[GAIN] == 1.0
     assert [float(step.fit.theta[DRAG]) for step in steps] == [0.0, 0.0]
 
 
-def test_the_true_effect_stays(problem):
-    steps, current, before = swapped(problem, DAMPING, DRAG, OFFSET)
+def test_the_true_effect_stays_and_what_it_leads_by_now_is_named_no_more(problem):
+    steps, current, before = reconsidered(problem, DAMPING, DRAG, OFFSET)
     assert [step.effect for step in steps] == [DAMPING, OFFSET]
-    assert steps[0].candidate.indistinguishable_from == (Named("quadratic_drag", AT),)
+    assert steps[0].candidate.indistinguishable_from == ()
+    assert current is before
+
+
+def test_what_cannot_be_told_from_it_beside_the_others_is_named(problem):
+    """The back EMF of the only motor is the damping of its joint."""
+    steps, current, before = reconsidered(problem, DAMPING, EMF, OFFSET, named=False)
+    assert [step.effect for step in steps] == [DAMPING, OFFSET]
+    assert steps[0].candidate.indistinguishable_from == (Named("back_emf", MOTOR),)
     assert current is before
 
 
