@@ -22,6 +22,8 @@ START_STEP = 1e-4
 """Finite difference of an initial state, relative to its spread."""
 LARGE = 1e8
 """Whitened residual that stands for a simulation that diverged."""
+COLLINEAR = 1e-7
+"""Singular value, relative to the largest, below which initial states make no direction anew."""
 
 
 class Predictor(Protocol):
@@ -234,14 +236,21 @@ def linearise(
 class StartSpace:
     """The residuals that initial states can make, orthonormal within each segment.
 
+    (By eigenvectors of the Gram matrix, twice, for the sake of rounding; Stathopoulos and Wu 2002.
+    For many tall matrices that is a tenth of the time of singular value decompositions.)
+
     Attributes:
         basis: [S, N, nq + nv]; zero where a direction is not excited.
     """
 
     def __init__(self, sensitivity: np.ndarray):
         scale = np.linalg.norm(sensitivity, axis=1, keepdims=True)
-        u, s, _ = np.linalg.svd(sensitivity / np.maximum(scale, 1e-300), full_matrices=False)
-        self.basis = u * (s > 1e-9 * s.max(axis=1, keepdims=True))[:, None, :]
+        self.basis = sensitivity / np.maximum(scale, 1e-300)
+        for _ in range(2):
+            square, ways = np.linalg.eigh(np.swapaxes(self.basis, 1, 2) @ self.basis)
+            is_excited = square > COLLINEAR**2 * square.max(axis=1, keepdims=True)
+            factor = np.where(is_excited, 1.0 / np.sqrt(np.maximum(square, 1e-300)), 0.0)
+            self.basis = self.basis @ (ways * factor[:, None, :])
 
     def remove(self, columns: np.ndarray) -> np.ndarray:
         """Project columns [S, N, k] onto what no initial state can make."""

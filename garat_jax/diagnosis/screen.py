@@ -179,8 +179,10 @@ def _score(
     width = np.asarray([p.high - p.low for p in slots])
     is_tried = np.asarray([rows[i].column in trial.start for i in chosen]) & (not trial.is_only)
     times = np.divide(width, steps, out=np.ones_like(width), where=steps > 0)
-    seen = norm * np.where(is_tried, 1.0, np.maximum(times, 1.0)) > VISIBLE
-    seen &= norm > 1e-3 * norm.max(initial=0.0)
+    switched = np.asarray([rows[i].below == chosen[0] for i in chosen])
+    wanted = abs(matrix[:, 0] @ residual) / max(norm[0] ** 2, 1e-300)  # times what is tried
+    times = np.where(is_tried, np.where(switched, max(wanted, 1.0), 1.0), np.maximum(times, 1.0))
+    seen = (norm * times > VISIBLE) & (norm > 1e-3 * norm.max(initial=0.0))
     given = [k for k, i in enumerate(chosen) if rows[i].column in trial.start]
     if unseen := [slots[k].name for k in (0, *given) if not seen[k]]:
         reason = f"the recordings do not excite it: no signal depends on its {unseen[0]}"

@@ -14,6 +14,8 @@ from garat_jax.effects.most import follow_most
 
 REVERSED = 0.05
 """Speed, relative to its root mean square, within which dry friction is smoothed here."""
+UNTOUCHED = 0.2
+"""Share of the samples without contact at a joint from which those with one count for no ripple."""
 
 
 def suggest(
@@ -80,16 +82,20 @@ def _friction(m: MissingTorque, dof: int) -> np.ndarray:
 def _ripples(m: MissingTorque, dof: int) -> np.ndarray:
     """Return the torque missing at a dof less what smooth laws and dry friction explain, [2, M].
 
+    It is NaN where the model's contacts act at the joint, unless they seldom do not: noise opens
+    and closes them, and what that makes drowns a ripple.
+
     One is less what follows the command, too: a wrong gain would drown a ripple. In the other a
     controller's command, which fights the ripple and so has it, explains nothing of it. Of
     acceleration, load and command two will do: with one dof their torques add up to what is
     missing, whatever its law.
     """
+    counts = m.contact[:, dof] == 0.0
+    counts |= counts.mean() < UNTOUCHED
     rub = _friction(m, dof)
     laws = [np.ones(len(rub)), m.position[:, dof], *rub.T, m.load[:, dof]]
-    torque = m.torque[:, dof][:, None]
-    rests = (
-        without(torque, orthonormal(np.stack(columns, axis=1)))[:, 0]
-        for columns in (laws, [*laws, m.command[:, dof]])
-    )
-    return np.stack(list(rests))
+    torque, rests = m.torque[counts, dof][:, None], np.full((2, len(rub)), np.nan)
+    for rest, columns in zip(rests, (laws, [*laws, m.command[:, dof]]), strict=True):
+        basis = orthonormal(np.stack(columns, axis=1)[counts])
+        rest[counts] = without(torque, basis)[:, 0]
+    return rests

@@ -266,7 +266,8 @@ class Effect(abc.ABC):
         Args:
             position: Where the joint was measured, [M].
             torque: What the model lacks there, less what damping and dry friction explain, [M].
-            rests: The same less what other laws may explain, in some ways, [K, M].
+            rests: The same less what other laws may explain, in some ways, [K, M]; NaN where
+                contacts make it what it is.
         """
         del position, torque, rests
         return None

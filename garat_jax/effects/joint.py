@@ -259,12 +259,14 @@ class CoggingTorque(Effect):
             return None
         starts = []
         for rest in rests:
+            counts = np.isfinite(rest)
+            angle, rest = position[counts], rest[counts]
             for _ in range(PEAKS):
-                peak = _highest_peak(position, rest, low, high)
+                peak = _highest_peak(angle, rest, low, high)
                 if peak is None:
                     break
-                size, phase, _ = _wave(peak, position, rest)
-                rest = rest - size * np.sin(peak * position + phase)
+                size, phase, _ = _wave(peak, angle, rest)
+                rest = rest - size * np.sin(peak * angle + phase)
                 size = min(size, amplitude.high)
                 starts.append({"amplitude": size, "periods": peak, "phase": phase})
         num_tried = len(rests) * math.ceil((high - low) * span / (2 * np.pi))

@@ -18,9 +18,10 @@ from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, metric_spread,
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.timestep import count_timestep
-from garat_jax.effects import ActuatorDelay, TorqueSaturation, ViscousDamping
+from garat_jax.effects import ActuatorDelay, CoggingTorque, TorqueSaturation, ViscousDamping
 from garat_jax.errors import UserError
 from tests import models
+from tests.diagnosis import pendulum
 
 MODEL = Model("pendulum", __file__, __file__, models.spec(models.PENDULUM))
 
@@ -281,3 +282,19 @@ def test_few_segments_that_all_hold_much_of_the_residual_count_alike():
     assert len(heavy) > 1
     (score,) = screen(problem.take(heavy), settled.take(heavy))
     assert score.share > 0.9
+
+
+def test_a_law_that_is_switched_on_by_its_size_is_seen_at_the_size_that_is_missing():
+    """At a hundredth of a newton metre no signal would tell the number of periods."""
+
+    def ripple(angle: float) -> float:
+        return 0.3 * np.sin(12 * angle + 0.4)
+
+    recordings = [pendulum.record(lambda spec: None, seed, ripple=ripple) for seed in range(2)]
+    problem = make_problem(recordings, [CoggingTorque("joint/hinge")], timestep=0.004)
+    before = settle(problem, problem.simulator.base, problem.segments.start)
+    assert np.linalg.norm(before.residual) > 100
+    few = problem.take(np.arange(4))
+    (score,) = screen(few, before.take(np.arange(4)))
+    assert not score.excluded
+    assert score.share > 0.5
