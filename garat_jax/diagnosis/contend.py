@@ -18,7 +18,7 @@ from garat_jax.diagnosis.starts import Fit
 from garat_jax.diagnosis.timestep import count_timestep
 
 CONTENDERS = 4
-"""How many candidates are fitted each round, besides those that are like the first."""
+"""How many candidates are fitted each round, those that are like the first counted as one."""
 SAME = 1.0 - 1e-9
 """Cosine of two candidates' changes from which they are one change."""
 FIRM = 2.0
@@ -69,9 +69,7 @@ def fit_contenders(
     likely = [s for s in likely if s.share > 0.25 * likely[0].share]
     likely = [s for s in likely if not simpler_law(problem, s, likely)]
     likely = [s for i, s in enumerate(likely) if not twins(s, likely[:i])]
-    chosen = likely[:CONTENDERS]
-    chosen += [s for s in likely[CONTENDERS:] if cosine(s, likely[0]) > EQUIVALENT]
-    for score in chosen:
+    for score in _first_of(likely):
         rival = min((c.fit.cost[problem.fitted].sum() for c in contenders), default=np.inf)
         hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
@@ -79,6 +77,17 @@ def fit_contenders(
             continue
         contenders.append(_fit(problem, current, score, rival, say))
     return contenders
+
+
+def _first_of(likely: Sequence[Score]) -> list[Score]:
+    """Return the first candidates that are not like the very first, and all that are."""
+    chosen, num_others = [], 0
+    for score in likely:
+        is_alike = score is likely[0] or cosine(score, likely[0]) > EQUIVALENT
+        if is_alike or num_others < CONTENDERS - 1:
+            chosen.append(score)
+        num_others += not is_alike
+    return chosen
 
 
 def fit_refinements(

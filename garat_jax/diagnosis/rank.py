@@ -16,6 +16,7 @@ from garat_jax.diagnosis.contend import (
     complete,
     fit_contenders,
     is_predicted,
+    refines,
     renamed,
     stands_for,
     with_evidence,
@@ -25,6 +26,7 @@ from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import (
     ANOTHER_MAY_HELP,
+    NO_CERTAIN_LEAD,
     Judged,
     do_the_same,
     estimates,
@@ -33,6 +35,7 @@ from garat_jax.diagnosis.judge import (
     leads,
 )
 from garat_jax.diagnosis.metric import (
+    AT_FLOOR,
     Floor,
     Metric,
     is_above,
@@ -61,9 +64,9 @@ class Path(NamedTuple):
 
     @property
     def second(self) -> Contender | None:
-        """What would pass then."""
+        """What would pass then, or would but for another that explains as much."""
         candidate, contender = self.then[0]
-        return contender if candidate.passes else None
+        return contender if candidate.passes or candidate.why == NO_CERTAIN_LEAD else None
 
     @property
     def fit(self) -> Fit:
@@ -265,19 +268,20 @@ def _round(
 
 
 def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, held, say):
-    """Where only another effect may keep the first candidate back, see what each leads to with one.
+    """Where another effect may change which comes first, see what each candidate leads to with one.
 
     Of two effects that are missing, neither explains so much by itself that no third can rival it,
-    and the other may drown what it gains on what is held out.
+    and the other may drown what it gains on what is held out. And a law that refines another may do
+    some of what that one does with a further effect.
 
     Returns:
         The candidates, the first of which passes if with another it leads its rivals with another;
-        and what is to be added: the first if it passes, with the other if it needs that.
+        and what is to be added: the first if it passes, with the other if it needs that and no
+        third explains as much; a next round may tell these.
     """
-    if not judged or judged[0][0].why not in ANOTHER_MAY_HELP:
+    rivals = _rivals(problem, metric, judged)
+    if not rivals:
         return judged, _first_step(judged, current)
-    first = judged[0][0]
-    rivals = [(c, k) for c, k in judged if k and c.named not in first.indistinguishable_from]
     paths = []
     for candidate, contender in rivals[: 1 + RIVALS]:
         say(f"looking for what would be missing beside {candidate.named}")
@@ -287,15 +291,33 @@ def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, 
         paths.append(Path(candidate, contender, then))
     best = min(paths, key=lambda path: path.fit.cost.sum())
     others = [path.fit for path in paths if not best.is_like(path)]
+    others += [k.fit for first, k in judged[:1] if k and first.passes]
     may = best.second and best.candidate.why in ANOTHER_MAY_HELP
     may = may and held_out_gain(problem, metric, current, best.fit).low > 0
     if not may or not all(leads(problem, best.fit, other) for other in others):
-        return judged, []
+        return judged, _first_step(judged, current)
     why = f"passes every gate together with {best.then[0][0].named}"
     passed = dataclasses.replace(best.candidate, passes=True, why=why)
     rest = [pair for pair in judged if pair[1] is not best.contender]
     judged = [(passed, best.contender), *rest]
     return judged, [*_first_step(judged, current), *_first_step(best.then, best.contender.fit)]
+
+
+def _rivals(problem: Problem, metric: Metric, judged: Judged) -> list[tuple[Candidate, Contender]]:
+    """Return the candidates of which another effect may make the first, with their fits.
+
+    Where one passes, these are the laws that it refines, unless it leaves no more than noise.
+    """
+    fitted = [(candidate, contender) for candidate, contender in judged if contender]
+    for first, contender in fitted[:1]:
+        if first.passes:
+            floor = noise_floor(problem, metric, contender.fit)
+            is_open = is_above(problem, metric, contender.fit, floor, AT_FLOOR)
+            own = contender.score.effect
+            return [(c, k) for c, k in fitted if is_open and refines(problem, own, k.score.effect)]
+        if first.why in ANOTHER_MAY_HELP:
+            return [(c, k) for c, k in fitted if c.named not in first.indistinguishable_from]
+    return []
 
 
 def _first_step(judged: Judged, current: Fit) -> list[Step]:

@@ -10,9 +10,9 @@ from garat_jax.diagnosis.starts import Fit
 
 
 def refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):
-    """Replace the best contender, and those that it does not lead, by refinements of their laws.
+    """Put before the best contender, and those that it does not lead, refinements of their laws.
 
-    A refinement comes in a law's place where it certainly explains more. Screening prefers the
+    A refinement comes before a law where it certainly explains more. Screening prefers the
     simpler law. A refinement's threshold hides it there; one without waits for the next round,
     where other effects rival it, if the simpler law proves itself and has no rival.
     """
@@ -28,7 +28,8 @@ def refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Flo
             for refined in fit_refinements(problem, current, name, scores, say, waits):
                 known = (c.fit for c in contenders if c.score.effect == refined.score.effect)
                 if all(leads(problem, refined.fit, fit) for fit in (rival.fit, *known)):
-                    contenders, rival = _replaced(contenders, rival, refined), refined
+                    others = [c for c in contenders if c.score.effect != refined.score.effect]
+                    contenders, rival = [refined, *others], refined
     return contenders
 
 

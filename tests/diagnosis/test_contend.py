@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis import rivals
+from garat_jax.diagnosis import contend, rivals
 from garat_jax.diagnosis.contend import fit_contenders, with_twins
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.screen import screen
+from garat_jax.diagnosis.screen import Score, screen
 from garat_jax.diagnosis.starts import settle
 from garat_jax.effects import BackEmf, ViscousDamping
 from tests import models
@@ -104,7 +104,7 @@ def test_refinements_are_tried_of_all_that_fit_as_well_and_replace_no_better_fit
     kept = rivals.refine(None, None, None, (), contenders, None, print)
     assert {id(contender) for contender, _ in tried} == {id(c) for c in (best, as_good, known)}
     assert not any(hidden_only for _, hidden_only in tried)  # none waits for another round
-    assert {id(c) for c in kept} == {id(c) for c in (of_as_good, best, worse, known)}
+    assert {id(c) for c in kept} == {id(c) for c in (of_as_good, *contenders)}
 
 
 def test_a_law_without_rivals_that_proves_itself_is_refined_in_the_next_round(monkeypatch):
@@ -121,3 +121,13 @@ def test_a_law_without_rivals_that_proves_itself_is_refined_in_the_next_round(mo
         monkeypatch.setattr(rivals, "held_out_gain", lambda *_, low=low: SimpleNamespace(low=low))
         rivals.refine(None, None, None, (), [one], None, print)
     assert waits == [True, False]
+
+
+def test_of_many_that_are_like_the_first_none_takes_the_place_of_another():
+    def scored(effect: int, share: float, *contribution: float) -> Score:
+        return Score(effect, (effect,), (1.0,), {}, share, 0.0, True, np.asarray(contribution))
+
+    alike = [scored(i, 0.9 - 0.1 * i, 1.0, 0.01 * i, 0.0) for i in range(5)]
+    others = [scored(5 + i, 0.3 - 0.01 * i, 0.0, 1.0, float(i)) for i in range(4)]
+    chosen = contend._first_of([*alike[:3], others[0], *alike[3:], *others[1:]])
+    assert [score.effect for score in chosen] == [0, 1, 2, 5, 3, 4, 6, 7]

@@ -1,6 +1,7 @@
 """A law that refines another is named where it explains more, and not where it does not."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -72,6 +73,27 @@ def test_damping_with_a_little_dry_friction_is_not_called_asymmetric():
     found = diagnose(model, [record(rub, seed) for seed in range(4)])
     assert found.selected[0].effect == "viscous_damping"
     assert "asymmetric_friction" not in [c.effect for c in found.selected]
+
+
+def test_two_simple_laws_come_before_one_that_does_less_than_both():
+    """Beside the dry friction that the model has, a pull makes friction of one direction."""
+    kinds = ("torque_offset", "viscous_damping", "asymmetric_friction")
+
+    def rub(spec, damping: float = 0.0):
+        spec.joint("hinge").frictionloss = 0.15
+        spec.joint("hinge").damping[0] += damping
+
+    spec = MODEL.spec.copy()
+    rub(spec)
+    catalogue = {kind: CATALOGUE[kind] for kind in kinds}
+    model = dataclasses.replace(MODEL, spec=spec, catalogue=catalogue)
+    damped = functools.partial(rub, damping=0.02)
+    found = diagnose(model, [record(damped, seed, pull=-0.04) for seed in range(4)])
+    sizes = {c.effect: next(iter(c.parameters.values())).estimate for c in found.selected}
+    assert sizes == {
+        "viscous_damping": pytest.approx(0.02, rel=0.02),
+        "torque_offset": pytest.approx(-0.04, rel=0.02),
+    }
 
 
 def test_damping_is_refined_whatever_name_it_was_fitted_under():
