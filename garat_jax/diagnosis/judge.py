@@ -95,8 +95,9 @@ def _alike(
     """List for each contender those that these recordings do not tell from it.
 
     They do much the same, and neither leads for certain or both leave no more than noise and the
-    integrator make: what the one explains beyond that is not physics. That a law has more
-    parameters may tell it from one that it refines, and from no other.
+    integrator make: what the one explains beyond that is not physics. Where both is so, they need
+    not do the same: beside contacts, initial states that jump are most of what a fit changes. That
+    a law has more parameters may tell it from one that it refines, and from no other.
 
     Args:
         problem: What is fitted.
@@ -114,8 +115,10 @@ def _alike(
         paid = [0.0] if are_related else [0.0, penalty[other] - penalty[one]]
         leads = (drawn[:, other] - drawn[:, one])[:, None] - paid
         low, middle, high = np.quantile(leads, [0.025, 0.5, 0.975], axis=0)
-        close = low.min() < 0 < high.max() or np.abs(middle).min() < np.log(TOO_CLOSE)
-        return bool(same and (close or (at_floor[one] and at_floor[other])))
+        neither_leads = low.min() < 0 < high.max()
+        is_close = neither_leads or np.abs(middle).min() < np.log(TOO_CLOSE)
+        nothing_left = at_floor[one] and at_floor[other]
+        return bool((same and (is_close or nothing_left)) or (neither_leads and nothing_left))
 
     every = range(len(contenders))
     return [[j for j in every if j != i and are_alike(i, j)] for i in every]

@@ -281,7 +281,7 @@ def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, 
     """
     rivals = _rivals(problem, metric, judged)
     if not rivals:
-        return judged, _first_step(judged, current)
+        return judged, _first_step(problem, judged, current)
     paths = []
     for candidate, contender in rivals[: 1 + RIVALS]:
         say(f"looking for what would be missing beside {candidate.named}")
@@ -295,12 +295,13 @@ def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, 
     may = best.second and best.candidate.why in ANOTHER_MAY_HELP
     may = may and held_out_gain(problem, metric, current, best.fit).low > 0
     if not may or not all(leads(problem, best.fit, other) for other in others):
-        return judged, _first_step(judged, current)
+        return judged, _first_step(problem, judged, current)
     why = f"passes every gate together with {best.then[0][0].named}"
     passed = dataclasses.replace(best.candidate, passes=True, why=why)
     rest = [pair for pair in judged if pair[1] is not best.contender]
     judged = [(passed, best.contender), *rest]
-    return judged, [*_first_step(judged, current), *_first_step(best.then, best.contender.fit)]
+    second = _first_step(problem, best.then, best.contender.fit)
+    return judged, [*_first_step(problem, judged, current), *second]
 
 
 def _rivals(problem: Problem, metric: Metric, judged: Judged) -> list[tuple[Candidate, Contender]]:
@@ -320,15 +321,29 @@ def _rivals(problem: Problem, metric: Metric, judged: Judged) -> list[tuple[Cand
     return []
 
 
-def _first_step(judged: Judged, current: Fit) -> list[Step]:
+def _first_step(problem: Problem, judged: Judged, current: Fit) -> list[Step]:
     """Return a round's first candidate as a step from the fit before it, if it passes."""
     steps = []
     for first, contender in judged[:1]:
         if first.passes and contender:
-            others = [(c, k) for c, k in judged[1:] if k]
-            alike = [(c, k) for c, k in others if do_the_same(current, contender, k)]
+            equals = first.indistinguishable_from
+            alike = [
+                (c, k)
+                for c, k in judged[1:]
+                if k and (c.named in equals or _may_be_meant(problem, current, contender, k))
+            ]
             steps.append(Step(first, contender, contender.fit, alike))
     return steps
+
+
+def _may_be_meant(problem: Problem, current: Fit, one: Contender, other: Contender) -> bool:
+    """Say whether a contender does much what another does, and neither law refines the other's.
+
+    A refinement can do all that the simpler law does, and always fits a little better.
+    """
+    owners = one.score.effect, other.score.effect
+    are_related = refines(problem, *owners) or refines(problem, *owners[::-1])
+    return not are_related and do_the_same(current, one, other)
 
 
 def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:

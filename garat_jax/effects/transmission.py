@@ -26,6 +26,8 @@ RIGID = 1e9
 """Stiffness [N m/rad] that stands for "does not bend"."""
 RESONANCES = (3.0, 8.0, 20.0, 50.0)
 """Frequencies [Hz] of motor against link at which a flexible joint is tried."""
+DAMPED = 0.05
+"""Damping there, relative to the critical one; without any it would ring through whole segments."""
 CONTACT = 0.5
 """Impulse per speed of contact in a substep, relative to the reduced inertia."""
 SPRING_SHARE = 0.25
@@ -268,11 +270,12 @@ class JointFlexibility(Transmission):
 
     @classmethod
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
-        """Try stiffnesses that put the resonance of motor against link at several frequencies."""
+        """Try springs that put the resonance of motor against link at several frequencies."""
         dof = int(host.joint(target.partition("/")[2]).dofadr[0])
         motor, link = float(host.dof_armature[dof]), link_inertia(host, dof)
         reduced = motor * link / (motor + link)
-        return tuple({"stiffness": reduced * (2 * np.pi * f) ** 2} for f in RESONANCES)
+        rates, lost = 2 * np.pi * np.asarray(RESONANCES), 2 * DAMPED * reduced
+        return tuple({"stiffness": reduced * w**2, "damping": lost * w} for w in rates)
 
     @property
     def active(self) -> jax.Array:

@@ -25,12 +25,29 @@ def problem():
     return dataclasses.replace(problem, fitted=fitted)
 
 
-def judged(problem, left_by_rich: float, left_by_simple: float, p_value: float = 1e-9):
-    """Judge two laws that do much the same to a large residual, and leave some of the noise."""
+def judged(
+    problem,
+    left_by_rich: float,
+    left_by_simple: float,
+    p_value: float = 1e-9,
+    large: float = 10.0,
+    other_noise: bool = False,
+):
+    """Judge two laws that do much the same to a large residual, and leave some of the noise.
+
+    Args:
+        problem: What is fitted.
+        left_by_rich: How much of the noise the richer law leaves.
+        left_by_simple: And the simpler.
+        p_value: The simpler one's.
+        large: What the residual is beside the noise, in its units.
+        other_noise: Whether the richer law leaves noise of its own, and was expected to.
+    """
     start = settle(problem, problem.simulator.base, problem.segments.start)
     rng = np.random.default_rng(0)
     noise = rng.normal(size=start.residual.shape)
-    wave = 10.0 * np.sin(np.arange(noise.size)).reshape(noise.shape)
+    wave = large * np.sin(np.arange(noise.size)).reshape(noise.shape)
+    another = rng.normal(size=noise.shape)
     current = dataclasses.replace(start, residual=noise + wave)
 
     def contender(effect: int, columns, left: float, p_value: float) -> Contender:
@@ -43,6 +60,10 @@ def judged(problem, left_by_rich: float, left_by_simple: float, p_value: float =
         return Contender(score, fit)
 
     rich = contender(0, (0, 1, 2), left_by_rich, 1e-9)
+    if other_noise:
+        score = dataclasses.replace(rich.score, contribution=(wave + 3.0 * another).ravel())
+        fit = dataclasses.replace(rich.fit, residual=left_by_rich * another)
+        rich = dataclasses.replace(rich, score=score, fit=fit)
     simple = contender(1, (3,), left_by_simple, p_value)
     metric = make_metric(problem)
     floor = noise_floor(problem, metric, start)
@@ -55,6 +76,14 @@ def test_of_laws_that_both_reach_the_noise_the_simpler_counts(problem):
     first, second = judged(problem, 0.7, 0.8)
     assert (first.effect, second.effect) == (SIMPLE, RICH)
     assert [named.effect for named in first.indistinguishable_from] == [RICH]
+    assert first.passes
+
+
+@pytest.mark.parametrize(("left", "equals"), [(1.0, [RICH]), (1.3, [])])
+def test_laws_that_do_not_do_the_same_are_equals_where_both_reach_the_noise(problem, left, equals):
+    first, _ = judged(problem, left, left, large=2.0 * left, other_noise=True)
+    assert first.effect == SIMPLE
+    assert [named.effect for named in first.indistinguishable_from] == equals
     assert first.passes
 
 
