@@ -36,6 +36,8 @@ GROWTH = 1.5
 """A secret that does not show is enlarged by this factor ..."""
 MOST_ENLARGED = 4
 """... so often, before another place is tried."""
+MOST_DRAWN = 3
+"""A set that shows on no robot is drawn anew, with another rate and noise, so often in all."""
 
 
 class Case(NamedTuple):
@@ -155,6 +157,14 @@ def draw(case: Case, scenes: Surveys, robots: Sequence[str] = tuple(ROBOTS)) -> 
         ValueError: None of the robots can carry the effects visibly.
     """
     rng = np.random.default_rng(case.seed)
+    for _ in range(MOST_DRAWN):
+        if truth := _draw_once(case, scenes, robots, rng):
+            return truth
+    raise ValueError(f"{case.name} does not show on any of {', '.join(robots)}")
+
+
+def _draw_once(case: Case, scenes: Surveys, robots: Sequence[str], rng) -> Truth | None:
+    """Draw a case, on the first robot of a random order on which it shows, or None."""
     timing = any(kind in TIMINGS for kind in case.kinds)
     late = rng.random() < WITH_DELAY and not timing
     delay = float(rng.uniform(0.0, LARGEST_DELAY)) if late else 0.0
@@ -175,7 +185,7 @@ def draw(case: Case, scenes: Surveys, robots: Sequence[str] = tuple(ROBOTS)) -> 
         if len(found) == len(case.kinds):
             secrets, seen = tuple(s for s, _ in found), tuple(v for _, v in found)
             return Truth(case, robot, secrets, rate, seconds, noise, delay, seen)
-    raise ValueError(f"{case.name} does not show on any of {', '.join(robots)}")
+    return None
 
 
 def _place(scene: Scene, eye: Eye, kind: str, size: float, rng) -> tuple[Secret, float] | None:

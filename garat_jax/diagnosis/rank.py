@@ -6,17 +6,18 @@ runner-up, each with a block-bootstrap interval, and stability over block resamp
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from garat_jax.diagnosis.ahead import choose
 from garat_jax.diagnosis.contend import (
     Contender,
     complete,
     fit_contenders,
     is_predicted,
-    refines,
     renamed,
     stands_for,
     with_evidence,
@@ -25,17 +26,11 @@ from garat_jax.diagnosis.contend import (
 from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import (
-    ANOTHER_MAY_HELP,
-    NO_CERTAIN_LEAD,
     Judged,
-    do_the_same,
     estimates,
-    held_out_gain,
     judge,
-    leads,
 )
 from garat_jax.diagnosis.metric import (
-    AT_FLOOR,
     Floor,
     Metric,
     is_above,
@@ -50,39 +45,7 @@ from garat_jax.diagnosis.starts import Fit, settle, settle_twice
 from garat_jax.diagnosis.steps import Step, prune, reconsider, refitted
 from garat_jax.diagnosis.timestep import count_timestep
 
-RIVALS = 2
-"""How many candidates behind the first are followed for one more effect."""
 ROUNDS = 5
-
-
-class Path(NamedTuple):
-    """A candidate that may be added, and the round that would follow."""
-
-    candidate: Candidate
-    contender: Contender
-    then: Judged
-
-    @property
-    def second(self) -> Contender | None:
-        """What would pass then, or would but for another that explains as much."""
-        candidate, contender = self.then[0]
-        return contender if candidate.passes or candidate.why == NO_CERTAIN_LEAD else None
-
-    @property
-    def fit(self) -> Fit:
-        """Where the path leads."""
-        return (self.second or self.contender).fit
-
-    @property
-    def named(self) -> set[Named]:
-        """What is added on it."""
-        return {self.candidate.named, *([self.then[0][0].named] if self.second else [])}
-
-    def is_like(self, other: "Path") -> bool:
-        """Say whether the other adds the same, or what recordings cannot tell from it."""
-        added = [self.candidate, *([self.then[0][0]] if self.second else [])]
-        alike = {named for c in added for named in (c.named, *c.indistinguishable_from)}
-        return len(self.named) == len(other.named) and other.named <= alike
 
 
 class Outcome(NamedTuple):
@@ -212,7 +175,8 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}")
         judged = _round(problem, metric, current, held, floor, say, refinable=held)
-        judged, chosen = _look_ahead(problem, metric, current, judged, held, say)
+        follow = functools.partial(_follow, problem, metric, held, say)
+        judged, chosen = choose(problem, metric, current, judged, follow, say)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         contender = judged[0][1] if judged else None
         best = contender.fit if contender is not None else best
@@ -267,83 +231,11 @@ def _round(
     return judge(problem, metric, current, scores, contenders, floor)
 
 
-def _look_ahead(problem: Problem, metric: Metric, current: Fit, judged: Judged, held, say):
-    """Where another effect may change which comes first, see what each candidate leads to with one.
-
-    Of two effects that are missing, neither explains so much by itself that no third can rival it,
-    and the other may drown what it gains on what is held out. And a law that refines another may do
-    some of what that one does with a further effect.
-
-    Returns:
-        The candidates, the first of which passes if with another it leads its rivals with another;
-        and what is to be added: the first if it passes, with the other if it needs that and no
-        third explains as much; a next round may tell these.
-    """
-    rivals = _rivals(problem, metric, judged)
-    if not rivals:
-        return judged, _first_step(problem, judged, current)
-    paths = []
-    for candidate, contender in rivals[: 1 + RIVALS]:
-        say(f"looking for what would be missing beside {candidate.named}")
-        floor = noise_floor(problem, metric, contender.fit)
-        effects = [*held, contender.score.effect]
-        then = _round(problem, metric, contender.fit, effects, floor, say)
-        paths.append(Path(candidate, contender, then))
-    best = min(paths, key=lambda path: path.fit.cost.sum())
-    others = [path.fit for path in paths if not best.is_like(path)]
-    others += [k.fit for first, k in judged[:1] if k and first.passes]
-    may = best.second and best.candidate.why in ANOTHER_MAY_HELP
-    may = may and held_out_gain(problem, metric, current, best.fit).low > 0
-    if not may or not all(leads(problem, best.fit, other) for other in others):
-        return judged, _first_step(problem, judged, current)
-    why = f"passes every gate together with {best.then[0][0].named}"
-    passed = dataclasses.replace(best.candidate, passes=True, why=why)
-    rest = [pair for pair in judged if pair[1] is not best.contender]
-    judged = [(passed, best.contender), *rest]
-    second = _first_step(problem, best.then, best.contender.fit)
-    return judged, [*_first_step(problem, judged, current), *second]
-
-
-def _rivals(problem: Problem, metric: Metric, judged: Judged) -> list[tuple[Candidate, Contender]]:
-    """Return the candidates of which another effect may make the first, with their fits.
-
-    Where one passes, these are the laws that it refines, unless it leaves no more than noise.
-    """
-    fitted = [(candidate, contender) for candidate, contender in judged if contender]
-    for first, contender in fitted[:1]:
-        if first.passes:
-            floor = noise_floor(problem, metric, contender.fit)
-            is_open = is_above(problem, metric, contender.fit, floor, AT_FLOOR)
-            own = contender.score.effect
-            return [(c, k) for c, k in fitted if is_open and refines(problem, own, k.score.effect)]
-        if first.why in ANOTHER_MAY_HELP:
-            return [(c, k) for c, k in fitted if c.named not in first.indistinguishable_from]
-    return []
-
-
-def _first_step(problem: Problem, judged: Judged, current: Fit) -> list[Step]:
-    """Return a round's first candidate as a step from the fit before it, if it passes."""
-    steps = []
-    for first, contender in judged[:1]:
-        if first.passes and contender:
-            equals = first.indistinguishable_from
-            alike = [
-                (c, k)
-                for c, k in judged[1:]
-                if k and (c.named in equals or _may_be_meant(problem, current, contender, k))
-            ]
-            steps.append(Step(first, contender, contender.fit, alike))
-    return steps
-
-
-def _may_be_meant(problem: Problem, current: Fit, one: Contender, other: Contender) -> bool:
-    """Say whether a contender does much what another does, and neither law refines the other's.
-
-    A refinement can do all that the simpler law does, and always fits a little better.
-    """
-    owners = one.score.effect, other.score.effect
-    are_related = refines(problem, *owners) or refines(problem, *owners[::-1])
-    return not are_related and do_the_same(current, one, other)
+def _follow(problem: Problem, metric: Metric, held, say, contender: Contender) -> Judged:
+    """Return the round that would follow if a contender were added to the effects held."""
+    effects = [*held, contender.score.effect]
+    floor = noise_floor(problem, metric, contender.fit)
+    return _round(problem, metric, contender.fit, effects, floor, say)
 
 
 def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:

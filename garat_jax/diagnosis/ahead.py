@@ -1,0 +1,157 @@
+"""Where no candidate passes by itself, or a simple law may be hidden: look one effect further.
+
+Of two effects that are missing, neither explains so much by itself that no third can rival it, and
+the other may drown what it gains on what is held out. And a law that refines another may do some of
+what that one does with a further effect.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+from garat_jax.diagnosis.contend import Contender, refines
+from garat_jax.diagnosis.findings import Candidate, Named
+from garat_jax.diagnosis.judge import (
+    ANOTHER_MAY_HELP,
+    NO_CERTAIN_LEAD,
+    Judged,
+    do_the_same,
+    held_out_gain,
+    leads,
+)
+from garat_jax.diagnosis.metric import AT_FLOOR, Metric, is_above, noise_floor
+from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.starts import Fit
+from garat_jax.diagnosis.steps import Step
+
+RIVALS = 2
+"""How many candidates behind the first are followed for one more effect."""
+TOGETHER = "passes every gate together with "
+
+
+class Path(NamedTuple):
+    """A candidate that may be added, and the round that would follow."""
+
+    candidate: Candidate
+    contender: Contender
+    then: Judged
+
+    @property
+    def second(self) -> Contender | None:
+        """What would pass then, or would but for another that explains as much."""
+        candidate, contender = self.then[0]
+        return contender if candidate.passes or candidate.why == NO_CERTAIN_LEAD else None
+
+    @property
+    def added(self) -> list[Candidate]:
+        """What is added on it."""
+        return [self.candidate, *([self.then[0][0]] if self.second else [])]
+
+    @property
+    def fit(self) -> Fit:
+        """Where the path leads."""
+        return (self.second or self.contender).fit
+
+    def adds(self, named: Named) -> bool:
+        """Say whether an effect is added on it, or what recordings cannot tell from one that is."""
+        return any(named in (c.named, *c.indistinguishable_from) for c in self.added)
+
+    def is_like(self, other: "Path") -> bool:
+        """Say whether the other adds the same, or what recordings cannot tell from it."""
+        same_number = len(self.added) == len(other.added)
+        return same_number and all(self.adds(c.named) for c in other.added)
+
+
+def choose(
+    problem: Problem,
+    metric: Metric,
+    current: Fit,
+    judged: Judged,
+    follow: Callable[[Contender], Judged],
+    say: Callable[[str], None],
+) -> tuple[Judged, list[Step]]:
+    """Return a round's candidates and what of them is to be added, which may need another.
+
+    Args:
+        problem: What is fitted.
+        metric: Of the errors.
+        current: The fit of the effects selected so far.
+        judged: The candidates, best first.
+        follow: Returns the round that would follow one.
+        say: Told what is being done.
+
+    Returns:
+        The candidates, the first of which passes if with another it leads its rivals with another,
+        or if all that these do not lead add it, too; and what is to be added: the first if it
+        passes, with the other if it needs that and no third explains as much; a next round may
+        tell these.
+    """
+    followed = []
+    for candidate, contender in _rivals(problem, metric, judged)[: 1 + RIVALS]:
+        say(f"looking for what would be missing beside {candidate.named}")
+        followed.append(Path(candidate, contender, follow(contender)))
+    if not followed:
+        return judged, _first_step(problem, judged, current)
+    best = min(followed, key=lambda path: path.fit.cost.sum())
+    known = [k.fit for first, k in judged[:1] if k and first.passes]
+    gains = best.second and held_out_gain(problem, metric, current, best.fit).low > 0
+    if not gains or not all(leads(problem, best.fit, fit) for fit in known):
+        return judged, _first_step(problem, judged, current)
+    others = [path for path in followed if not best.is_like(path)]
+    undecided = [best, *(path for path in others if not leads(problem, best.fit, path.fit))]
+    pairs = [(best.candidate, best.contender), *judged]
+    shared = (pair for pair in pairs if all(path.adds(pair[0].named) for path in undecided))
+    first, contender = next(shared, (best.candidate, None))
+    if contender is None or first.why not in ANOTHER_MAY_HELP:
+        return judged, _first_step(problem, judged, current)
+    itself = {first.named, *first.indistinguishable_from}
+    added = dict.fromkeys(c.named for path in undecided for c in path.added)
+    why = TOGETHER + " or ".join(str(named) for named in added if named not in itself)
+    first = dataclasses.replace(first, passes=True, why=why)
+    judged = [(first, contender), *(pair for pair in judged if pair[1] is not contender)]
+    steps = _first_step(problem, judged, current)
+    if len(undecided) == 1:
+        steps += _first_step(problem, best.then, best.contender.fit)
+    return judged, steps
+
+
+def _rivals(problem: Problem, metric: Metric, judged: Judged) -> list[tuple[Candidate, Contender]]:
+    """Return the candidates of which another effect may make the first, with their fits.
+
+    Where one passes, these are the laws that it refines, unless it leaves no more than noise.
+    """
+    fitted = [(candidate, contender) for candidate, contender in judged if contender]
+    for first, contender in fitted[:1]:
+        if first.passes:
+            floor = noise_floor(problem, metric, contender.fit)
+            is_open = is_above(problem, metric, contender.fit, floor, AT_FLOOR)
+            own = contender.score.effect
+            return [(c, k) for c, k in fitted if is_open and refines(problem, own, k.score.effect)]
+        if first.why in ANOTHER_MAY_HELP:
+            return [(c, k) for c, k in fitted if c.named not in first.indistinguishable_from]
+    return []
+
+
+def _first_step(problem: Problem, judged: Judged, current: Fit) -> list[Step]:
+    """Return a round's first candidate as a step from the fit before it, if it passes."""
+    steps = []
+    for first, contender in judged[:1]:
+        if first.passes and contender:
+            equals = first.indistinguishable_from
+            alike = [
+                (c, k)
+                for c, k in judged[1:]
+                if k and (c.named in equals or _may_be_meant(problem, current, contender, k))
+            ]
+            steps.append(Step(first, contender, contender.fit, alike))
+    return steps
+
+
+def _may_be_meant(problem: Problem, current: Fit, one: Contender, other: Contender) -> bool:
+    """Say whether a contender does much what another does, and neither law refines the other's.
+
+    A refinement can do all that the simpler law does, and always fits a little better.
+    """
+    owners = one.score.effect, other.score.effect
+    are_related = refines(problem, *owners) or refines(problem, *owners[::-1])
+    return not are_related and do_the_same(current, one, other)

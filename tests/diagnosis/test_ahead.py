@@ -1,0 +1,98 @@
+"""What is added where no candidate passes by itself, by what each leads to with another."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.ahead import choose
+from garat_jax.diagnosis.contend import Contender
+from garat_jax.diagnosis.findings import Candidate, Interval, Named
+from garat_jax.diagnosis.judge import NO_CERTAIN_GAIN, NO_CERTAIN_LEAD
+from garat_jax.diagnosis.metric import make_metric
+from garat_jax.diagnosis.screen import Score
+from garat_jax.diagnosis.starts import settle
+from garat_jax.effects import CoulombFriction, GravityScale, TorqueOffset, ViscousDamping
+from tests.diagnosis.test_fit import make_problem, record
+
+TIME = np.arange(800) / 200.0
+EFFECTS = [
+    ViscousDamping("joint/hinge"),
+    GravityScale("world"),
+    TorqueOffset("joint/hinge"),
+    CoulombFriction("joint/hinge"),
+]
+DAMPING, GRAVITY, OFFSET, FRICTION = range(len(EFFECTS))
+
+
+@pytest.fixture(scope="module")
+def problem():
+    problem = make_problem([record(TIME), record(TIME)], EFFECTS)
+    fitted = np.arange(len(problem.fitted)) < len(problem.fitted) // 2
+    return dataclasses.replace(problem, fitted=fitted)
+
+
+def chosen(problem, second_of_damping: dict[int, float], second_of_gravity: dict[int, float]):
+    """Choose where damping, gravity and an offset explain 20, 19 and 18 % each by itself.
+
+    Args:
+        problem: What is fitted.
+        second_of_damping: What the best effect beside damping leaves of the residual.
+        second_of_gravity: And beside gravity. Beside the offset nothing passes.
+    """
+    current = settle(problem, problem.simulator.base, problem.segments.start)
+    residual = np.random.default_rng(0).normal(size=current.residual.shape)
+    current = dataclasses.replace(current, residual=residual)
+
+    def pair(effect: int, left: float, why: str) -> tuple[Candidate, Contender]:
+        contribution = np.random.default_rng(effect).normal(size=residual.size)
+        score = Score(effect, (effect,), (0.1,), {}, 0.9, 1e-9, True, contribution)
+        free = (*current.free, effect)
+        fit = dataclasses.replace(current, residual=left * residual, free=free)
+        law, none = EFFECTS[effect], Interval(0.0, 0.0, 0.0)
+        candidate = Candidate(law.kind, law.target, {}, 0.1, 0.0, 0.0, none, 0.5, (), False, why)
+        return candidate, Contender(score, fit)
+
+    seconds = {DAMPING: second_of_damping, GRAVITY: second_of_gravity}
+
+    def follow(contender: Contender):
+        beside = seconds.get(contender.score.effect)
+        if beside is None:
+            return [pair(DAMPING, 0.8, NO_CERTAIN_GAIN)]
+        return [pair(effect, left, NO_CERTAIN_LEAD) for effect, left in beside.items()]
+
+    judged = [
+        pair(DAMPING, 0.80, NO_CERTAIN_GAIN),
+        pair(GRAVITY, 0.81, NO_CERTAIN_LEAD),
+        pair(OFFSET, 0.82, NO_CERTAIN_LEAD),
+    ]
+    metric = make_metric(problem)
+    judged, steps = choose(problem, metric, current, judged, follow, lambda message: None)
+    return judged[0][0], [step.candidate.named for step in steps]
+
+
+def named(effect: int) -> Named:
+    return Named(EFFECTS[effect].kind, EFFECTS[effect].target)
+
+
+def test_a_path_that_leads_the_others_makes_its_first_pass(problem):
+    first, added = chosen(problem, {OFFSET: 0.3}, {OFFSET: 0.5})
+    assert added == [named(DAMPING)]
+    assert first.passes and first.why.endswith("together with torque_offset at joint/hinge")
+
+
+@pytest.mark.parametrize(
+    ("of_damping", "of_gravity"),
+    [({OFFSET: 0.30}, {DAMPING: 0.301}), ({OFFSET: 0.301}, {DAMPING: 0.30})],
+)
+def test_what_all_paths_share_that_none_leads_is_added(problem, of_damping, of_gravity):
+    first, added = chosen(problem, of_damping, of_gravity)
+    assert added == [named(DAMPING)]
+    assert first.passes
+    assert "torque_offset" in first.why and "gravity_scale" in first.why
+
+
+def test_nothing_is_added_where_no_path_leads_and_they_share_nothing(problem):
+    first, added = chosen(problem, {OFFSET: 0.3}, {FRICTION: 0.301})
+    assert added == []
+    assert not first.passes
