@@ -36,7 +36,7 @@ GROWTH = 1.5
 """A secret that does not show is enlarged by this factor ..."""
 MOST_ENLARGED = 4
 """... so often, before another place is tried."""
-MOST_DRAWN = 3
+MOST_DRAWN = 10
 """A set that shows on no robot is drawn anew, with another rate and noise, so often in all."""
 
 

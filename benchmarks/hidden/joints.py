@@ -8,6 +8,9 @@ from .secrets import AtDrivenJoint, AtJoint, jitter, signed, slide
 
 SMALLEST_FRICTION = 1e-9
 """Friction loss that makes MuJoCo reserve the constraint's row."""
+YIELDS = 0.01
+"""How far an end of a play gives way under the joint's torque, relative to the play: what is hidden
+is the play, which a law with rigid ends would see larger by twice that."""
 
 
 class ViscousDamping(AtJoint):
@@ -218,7 +221,12 @@ class Geared(AtDrivenJoint):
         link = joint.parent
         body = link.parent.add_body(name=rotor, pos=link.pos, quat=link.quat)
         body.add_joint(
-            name=rotor, type=joint.type, axis=joint.axis, pos=joint.pos, armature=joint.armature
+            name=rotor,
+            type=joint.type,
+            axis=joint.axis,
+            pos=joint.pos,
+            armature=joint.armature,
+            damping=np.zeros(3),  # the model's defaults are the link's
         )
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -263,7 +271,7 @@ class Backlash(Geared):
 
     def coupling(self, scene):
         dof = scene.dof(self.name)
-        stiffness = scene.torque[dof] / (0.05 * self["gap"])
+        stiffness = scene.torque[dof] / (YIELDS * self["gap"])
         return stiffness, np.sqrt(stiffness * scene.model.dof_armature[dof]), self["gap"] / 2
 
 

@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from garat_jax.diagnosis.descend import excited
 from garat_jax.diagnosis.diagnose import thin
 from garat_jax.diagnosis.differences import clear_differences, projected
 from garat_jax.diagnosis.findings import Estimate
-from garat_jax.diagnosis.fit import excited, fit
+from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric

@@ -1,15 +1,12 @@
-"""Fit parameters by Gauss-Newton with the initial state of every segment eliminated.
+"""Fit parameters by Gauss-Newton with the initial state of every segment eliminated."""
 
-The initial states leave the normal equations by projection (variable projection, Golub and Pereyra
-1973). Sensitivities to them, which are most of the simulations, are kept from step to step as long
-as the cost falls as they promise.
-"""
-
+import dataclasses
 from functools import partial
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import stats
 
+from garat_jax.diagnosis.descend import CONVERGED, FITTED, descend, excited, parameter_step
 from garat_jax.diagnosis.differences import (
     STEP,
     Differences,
@@ -21,39 +18,18 @@ from garat_jax.diagnosis.differences import (
 from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels, linearise
 from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.starts import (
-    KEPT_PROMISE,
     SETTLE_STEPS,
-    SETTLED,
     Fit,
     follow,
     follow_each,
-    measured_anew,
-    promised_costs,
     settle,
     settle_anew,
     settle_starts,
-    start_step,
 )
 
-FITTED = 1e-4
-"""Fall of the cost, relative to it, below which a fit has converged."""
-STEPS = 24
-"""Largest number of Gauss-Newton steps in a row."""
 DESCENTS = 2
 """Largest number of times that they are begun: again where initial states sought anew lowered the
-cost, or wider differences are needed than were at first."""
-SHRINK = 10.0
-"""Factor of the damping from a step that is not taken to the next; a tenth after one that is."""
-FIRST_SHRUNK = 1.0
-"""Damping, relative to what the data say, after the first that is not: half the step."""
-STALLED = 4
-"""Steps in a row, taken or not, none of which lowers the cost by `LITTLE`, after which a fit with
-wider differences has converged, too: initial states promise for ever what jumps do not let them
-keep."""
-LITTLE = 1e-3
-"""Fall of the cost, relative to it."""
-MOST_DAMPED = 1e4
-"""Damping, relative to what the data say, from which a fit makes no further step."""
+cost, wider differences are needed than were at first, or ones measured anew promise more."""
 SAME = 0.95
 """Cost with initial states sought anew, relative to that before, above which nothing is new."""
 WIDE = 0.5
@@ -72,8 +48,6 @@ SEARCH_ON = 0.99
 """Cost that a round reaches, relative to the one before, above which its steps were too long."""
 FINEST = 0.1
 """Shortest steps of a search, relative to its first."""
-BEATEN = 2.0
-"""Cost, relative to another fit's, above which a fit is not worth its last steps."""
 
 
 def fit(
@@ -106,11 +80,12 @@ def fit(
     is_stale, descents = sensitivity is not None, 0
     while True:
         near, descents = there, descents + 1
-        theta, start, lin = _descend(problem, free, rival, theta, start, near, is_stale)
+        theta, start, lin = descend(problem, free, rival, theta, start, near, is_stale)
         start, settled, is_better = _settle_all(problem, theta, start, lin)
         there = _differences_there(problem, theta, start, free, near.relative, settled)
         is_wider = np.any(there.is_clear & (there.relative > near.relative))
-        if descents == DESCENTS or not (is_better or is_wider):
+        goes_on = is_better or is_wider or promises_more(problem, theta, there, free)
+        if descents == DESCENTS or not goes_on:
             break
         is_stale = True
     lin = there.linearisation
@@ -134,6 +109,37 @@ def _differences_there(
     if any(is_erratic(c, problem.num_signals) for c in projected(problem, there)[0].T):
         return clear_differences(problem, theta, start, free, settled.start)
     return Differences(relative, np.ones(len(free), bool), there)
+
+
+def converge(problem: Problem, fitted: Fit, differences: Differences) -> tuple[Fit, Linearisation]:
+    """Take a fit's last steps, that change it by less than noise, and return what it is then.
+
+    Args:
+        problem: What is fitted.
+        fitted: The fit.
+        differences: Those at it, none across jumps.
+
+    Returns:
+        The fit, its intervals as they were, and the linearisation there.
+    """
+    free, theta, start = fitted.free, fitted.theta, fitted.start
+    theta, start, lin = descend(problem, free, np.inf, theta, start, differences, False, CONVERGED)
+    moved = {"theta": theta, "start": start, "residual": lin.residual, "sensitivity": lin.start}
+    return dataclasses.replace(fitted, **moved), lin
+
+
+def promises_more(problem: Problem, theta, there: Differences, free) -> bool:
+    """Say whether, with derivatives measured anew, a fit's end promises a lower cost.
+
+    Derivatives by the initial states that were kept from elsewhere may see none. Across jumps, all
+    promise more than is kept.
+    """
+    if np.any(there.relative > STEP):
+        return False
+    sensitivity, residual = projected(problem, there.linearisation)
+    change, _ = parameter_step(problem, theta, there.linearisation, free, 1e-4)
+    before = np.sum(residual**2)
+    return bool(before - np.sum((residual + sensitivity @ change) ** 2) > FITTED * before)
 
 
 def _settle_all(problem: Problem, theta, start, lin: Linearisation):
@@ -188,7 +194,7 @@ def _fit_across_contacts(problem: Problem, near: Fit, differences: Differences, 
 def _wide_step(problem: Problem, near: Fit, free, relative):
     """Take a Gauss-Newton step with `wide` differences; see `_fit_across_contacts`."""
     lin = wide(problem, near, free, relative)
-    change, keep = _parameter_step(problem, near.theta, lin, free, 1e-4)
+    change, keep = parameter_step(problem, near.theta, lin, free, 1e-4)
     theta = near.theta.copy()
     theta[list(free)] += change
     near = min((near, follow(problem, theta, near)), key=partial(_cost, problem))
@@ -224,119 +230,6 @@ def _search(problem: Problem, near: Fit, free, relative) -> np.ndarray:
         else:
             steps *= 0.3
     return near.theta
-
-
-def _descend(problem: Problem, free, rival: float, theta, start, near: Differences, is_stale: bool):
-    """Take Gauss-Newton steps of parameters and initial states together; see `fit`.
-
-    Each segment decides for itself whether its initial state follows, and when the derivatives by
-    it are measured again.
-
-    Args:
-        problem: What is fitted.
-        free: Indices of the parameters to fit.
-        rival: As for `fit`.
-        theta: Where to start, [num_parameters].
-        start: Initial states, [S, nq + nv].
-        near: Differences there; their relative steps are kept.
-        is_stale: Whether their derivatives by the initial states are from elsewhere.
-
-    Returns:
-        Parameters, initial states and the linearisation at them.
-    """
-    damping, undamped, stalled = 1e-4, np.zeros(len(start)), 0
-    patience = STALLED if np.any(near.relative > STEP) else STEPS
-    lin, is_old = near.linearisation, np.full(len(start), is_stale)
-    for taken in range(STEPS):
-        change, _ = _parameter_step(problem, theta, lin, free, damping)
-        expected = lin.residual + lin.parameters @ change
-        start_change = start_step(problem, lin, expected, undamped, 0.0)
-        before = np.sum(lin.residual**2, 1)
-        promised = before - promised_costs(lin, expected, start_change)
-        cost, promise = before[problem.fitted].sum(), promised[problem.fitted].sum()
-        if promise < FITTED * cost or damping > MOST_DAMPED or stalled == patience:
-            break
-        if taken > 1 and cost - promise > BEATEN * rival:
-            break
-        moved = theta.copy()
-        moved[list(free)] += change
-        steps = difference_steps(problem, moved, free, near.relative)
-        starts = start + start_change * problem.segments.start_unit
-        starts, trial = _tried(problem, moved, free, steps, start, starts, lin)
-        falls = before - np.sum(trial.residual**2, 1)
-        fall = falls[problem.fitted].sum()
-        missed = is_old & (promised > SETTLED * before) & (falls < KEPT_PROMISE * promised)
-        stalled = 0 if fall > LITTLE * cost else stalled + 1
-        if fall > 0:
-            theta, start, lin, damping = moved, starts, trial, damping / SHRINK
-            is_old = np.ones(len(start), bool)
-        elif not np.any(missed & problem.fitted):
-            damping = max(damping * SHRINK, FIRST_SHRUNK)
-        if np.any(missed):
-            lin, is_old = measured_anew(problem, theta, start, lin, missed), is_old & ~missed
-    return theta, start, lin
-
-
-def _tried(problem: Problem, theta, free, steps, stay, move, lin: Linearisation):
-    """Linearise where initial states move, or stay in segments that move for the worse.
-
-    Args:
-        problem: What is fitted.
-        theta: Parameters, [num_parameters].
-        free: Indices of the parameters to perturb.
-        steps: Their perturbations.
-        stay: Initial states before the step, [S, nq + nv].
-        move: Those after it.
-        lin: The linearisation before the step.
-
-    Returns:
-        Initial states, [S, nq + nv], and the linearisation there.
-    """
-    trial = linearise(problem, theta, move, free, steps, lin.start)
-    cost = np.sum(trial.residual**2, 1)
-    worse = np.flatnonzero(cost > np.sum(lin.residual**2, 1))
-    if not len(worse):
-        return move, trial
-    some, near = problem.take(worse), lin.start[worse]
-    stayed = linearise(some, theta, stay[worse], free, steps, near)
-    better = np.sum(stayed.residual**2, 1) < cost[worse]
-    chosen, start, residual = worse[better], move.copy(), trial.residual.copy()
-    parameters = trial.parameters.copy()
-    start[chosen], residual[chosen] = stay[chosen], stayed.residual[better]
-    parameters[chosen] = stayed.parameters[better]
-    return start, Linearisation(residual, parameters, trial.start)
-
-
-def excited(problem: Problem, free, sensitivity: np.ndarray) -> np.ndarray:
-    """Say which parameters would show within their bounds, [k] bool."""
-    width = [
-        problem.simulator.slots[j].parameter.high - problem.simulator.slots[j].parameter.low
-        for j in free
-    ]
-    return np.linalg.norm(sensitivity, axis=0) * np.asarray(width) > 3.0
-
-
-def _parameter_step(problem: Problem, theta, lin: Linearisation, free, damping: float):
-    """Return a damped step within the bounds [k], and which parameters are excited."""
-    sensitivity, residual = projected(problem, lin)
-    keep = excited(problem, free, sensitivity)
-    slots = [problem.simulator.slots[j].parameter for j in np.asarray(free)[keep]]
-    step = np.zeros(len(free))
-    if not slots:
-        return step, keep
-    unit = np.linalg.norm(sensitivity[:, keep], axis=0)
-    augmented = np.column_stack([sensitivity[:, keep] / unit, residual])
-    triangle = np.asarray(np.linalg.qr(augmented, mode="r"))
-    matrix = np.vstack([triangle[:, :-1], np.sqrt(damping + 1e-10) * np.eye(len(slots))])
-    target = np.concatenate([-triangle[:, -1], np.zeros(len(slots))])
-    now = theta[np.asarray(free)[keep]]
-    low = (np.asarray([p.low for p in slots]) - now) * unit
-    high = (np.asarray([p.high for p in slots]) - now) * unit
-    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
-    fixed = high - low < 1e-12 * unit
-    high = np.where(fixed, low + 1e-12 * unit, high)
-    step[keep] = optimize.lsq_linear(matrix, target, (low, high)).x / unit
-    return step, keep
 
 
 def interval(problem: Problem, theta, lin: Linearisation, free, keep):

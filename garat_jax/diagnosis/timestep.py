@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from garat_jax.diagnosis.differences import STEP, clear_differences, projected
-from garat_jax.diagnosis.fit import WIDE, fit, interval, uncertainty, wide
+from garat_jax.diagnosis.fit import WIDE, converge, fit, interval, uncertainty, wide
 from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels
 from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.starts import KEPT_PROMISE, Fit, follow, start_step
@@ -17,8 +17,6 @@ one. It is as much more as half the shift does less, or more, than was promised 
 
 UNFELT = 0.1
 """Norm of what a shift is to change, in standard deviations of noise, below which it is none."""
-SHIFTS = 4
-"""Largest number of Gauss-Newton steps to a timestep of 0."""
 EXPLAINED = 1.1
 """What would be left at a timestep of 0, relative to what the fit leaves, up to which that can be
 extrapolated."""
@@ -38,10 +36,12 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     keep = np.asarray([j not in fitted.frozen for j in fitted.free], bool)
     if not np.any(keep):
         return fitted
-    free, theta, start = fitted.free, fitted.theta, fitted.start
-    differences = clear_differences(problem, theta, start, free)
+    free = fitted.free
+    differences = clear_differences(problem, fitted.theta, fitted.start, free)
     lin = differences.linearisation
-    if not np.all(differences.is_clear[keep]):
+    if np.all(differences.is_clear[keep] & (differences.relative[keep] <= STEP)):
+        fitted, lin = converge(problem, fitted, differences)
+    elif not np.all(differences.is_clear[keep]):
         lin = wide(
             problem, fitted, free, np.where(differences.is_clear, differences.relative, WIDE)
         )
@@ -50,15 +50,15 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
         covariance, sure = uncertainty(problem, lin, keep)
         excited = np.asarray(free)[keep]
         fitted, rough[keep] = smooth_minimum(problem, fitted, excited, covariance, sure)
-        theta, start = fitted.theta, fitted.start
         lin = lin._replace(residual=fitted.residual)
+    theta, start = fitted.theta, fitted.start
     halved = problem.integrator_error(theta, start, fitted.residual)
     near = lin._replace(start=fitted.sensitivity)
     shift = _step(problem, near._replace(residual=2.0 * halved), theta, free, keep)
     kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
     there = None
     if abs(1.0 - kept) <= 1.0 - KEPT_PROMISE:
-        there = _step_on(problem, near._replace(residual=2.0 * halved), fitted, shift, keep)
+        there = _moved(problem, near._replace(residual=2.0 * halved), fitted, shift)
     if there is None:
         low, high = _wider(interval(problem, theta, lin, free, keep), rough)
         shift = _shift_by_fits(problem, fitted)
@@ -80,45 +80,34 @@ def _step(problem: Problem, lin: Linearisation, theta: np.ndarray, free, keep) -
     return (moved - theta)[list(free)]
 
 
-def _step_on(problem: Problem, change: Linearisation, fitted: Fit, shift: np.ndarray, keep):
-    """Take the step to a timestep of 0, and further ones as long as they lower what is left there.
-
-    The timestep's error may be so much larger than noise that one Gauss-Newton step does not undo
-    it. Steps undo what the timestep makes, not what was left by the fit.
+def _moved(problem: Problem, change: Linearisation, fitted: Fit, shift: np.ndarray):
+    """Return a fit's parameters at a timestep of 0, and the residual as it would be there.
 
     Args:
         problem: What is fitted.
         change: What a timestep of 0 changes of the fit's residual, with the fit's sensitivities.
         fitted: The fit.
-        shift: The first step of the free parameters, [k].
-        keep: Which of them are excited, [k] bool.
+        shift: The Gauss-Newton step of the free parameters that undoes the change, [k].
 
     Returns:
-        The parameters there, [num_parameters], and the residual as it would be, [S, N]; None where
-        not even the first step lowers what is left, or more stays than the fit leaves.
+        Parameters [num_parameters] and residual [S, N]; None where the step does not undo any of
+        it, or more is left than the fit leaves.
     """
-    free, unit = list(fitted.free), problem.segments.start_unit
-    theta, start, undamped = fitted.theta, fitted.start, np.zeros(len(fitted.start))
-    for _ in range(SHIFTS):
-        sensitivity, before = projected(problem, change)
-        if np.linalg.norm(sensitivity @ shift) < UNFELT:
-            break
-        moved = theta.copy()
-        moved[free] += shift
-        expected = change.residual + change.parameters @ shift
-        starts = start + start_step(problem, change, expected, undamped, 0.0) * unit
-        there = 2.0 * problem.residual_by(problem.finer, moved, starts)
-        there -= problem.residual_by(problem.simulator, moved, starts)
-        there = change._replace(residual=there - fitted.residual)
-        if np.linalg.norm(projected(problem, there)[1]) >= np.linalg.norm(before):
-            if theta is fitted.theta:
-                return None
-            break
-        theta, start, change = moved, starts, there
-        shift = _step(problem, change, theta, free, keep)
-    left = fitted.residual + change.residual
+    sensitivity, before = projected(problem, change)
+    if np.linalg.norm(sensitivity @ shift) < UNFELT:
+        return fitted.theta, fitted.residual + change.residual
+    moved = fitted.theta.copy()
+    moved[list(fitted.free)] += shift
+    expected, undamped = change.residual + change.parameters @ shift, np.zeros(len(fitted.start))
+    apart = start_step(problem, change, expected, undamped, 0.0) * problem.segments.start_unit
+    starts = fitted.start + apart
+    left = 2.0 * problem.residual_by(problem.finer, moved, starts)
+    left -= problem.residual_by(problem.simulator, moved, starts)
+    after = projected(problem, change._replace(residual=left - fitted.residual))[1]
     explains_less = _cost(problem, left) > EXPLAINED * _cost(problem, fitted.residual)
-    return None if theta is not fitted.theta and explains_less else (theta, left)
+    if explains_less or np.linalg.norm(after) >= np.linalg.norm(before):
+        return None
+    return moved, left
 
 
 def _cost(problem: Problem, residual: np.ndarray) -> float:

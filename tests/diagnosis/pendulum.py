@@ -20,6 +20,7 @@ def record(
     torque: Callable[[float], float] = lambda speed: 0.0,
     ripple: Callable[[float], float] = lambda angle: 0.0,
     control: Callable[[float, float, float], float] | None = None,
+    noise: float = 1e-3,
 ) -> Recording:
     """Record a pendulum that differs from the model, and at which a cable pulls [N m].
 
@@ -30,6 +31,7 @@ def record(
         torque: One more torque [N m] by the speed [rad/s].
         ripple: And one by the angle [rad].
         control: Gives the command by time, angle and speed, instead of random steps and a sine.
+        noise: Standard deviation of the angle [rad]; the speed's is ten times as much [rad/s].
     """
     rng = np.random.default_rng(seed)
     spec = models.spec(models.PENDULUM)
@@ -48,7 +50,7 @@ def record(
         for _ in range(round(0.004 / model.opt.timestep)):
             data.qfrc_applied[0] = pull + torque(data.qvel[0]) + ripple(data.qpos[0])
             mujoco.mj_step(model, data)
-    states = np.asarray(states) + 1e-3 * rng.normal(size=(len(TIME), 2)) * [1.0, 10.0]
+    states = np.asarray(states) + noise * rng.normal(size=(len(TIME), 2)) * [1.0, 10.0]
     return Recording(
         name=f"pull {pull}, {seed}",
         time=TIME,

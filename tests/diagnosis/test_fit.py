@@ -8,7 +8,8 @@ import pytest
 from scipy import signal
 
 from garat_jax.diagnosis.diagnose import make_candidates, split, thin
-from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.differences import clear_differences
+from garat_jax.diagnosis.fit import fit, promises_more
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
@@ -16,7 +17,7 @@ from garat_jax.diagnosis.problem import Problem, StartSpace
 from garat_jax.diagnosis.screen import cosine, screen
 from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, metric_spread, signal_noise
 from garat_jax.diagnosis.simulate import Simulator
-from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.starts import follow, settle
 from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.effects import ActuatorDelay, CoggingTorque, TorqueSaturation, ViscousDamping
 from garat_jax.errors import UserError
@@ -115,6 +116,17 @@ def test_estimates_are_what_a_timestep_of_zero_would_give():
     assert timeless.low[0] < timeless.theta[free[0]] < timeless.high[0]
     assert abs(timeless.theta[free[0]] - 0.02) < 0.2 * abs(found.theta[free[0]] - 0.02)
     assert timeless.high[0] - timeless.low[0] < 0.5 * (found.high[0] - found.low[0])
+
+
+@pytest.mark.parametrize(("widths", "promises"), [(0.0, False), (1.0, True)])
+def test_derivatives_measured_anew_say_that_a_fit_stopped_short(widths, promises):
+    problem = make_problem([record(UNIFORM, damping=0.02)], [ViscousDamping("joint/hinge")])
+    found = fit(problem, problem.simulator.base, problem.segments.start, (0,))
+    short = follow(problem, found.theta + widths * (found.high - found.low), found)
+    there = clear_differences(problem, short.theta, short.start, (0,))
+    assert promises_more(problem, short.theta, there, (0,)) is promises
+    across_jumps = there._replace(relative=2.0 * there.relative)
+    assert not promises_more(problem, short.theta, across_jumps, (0,))
 
 
 def test_settled_initial_states_leave_only_noise():

@@ -110,7 +110,7 @@ def test_derivatives_are_measured_anew_where_the_residual_is(puck, monkeypatch):
         seen.append(chosen)
         return measured_anew(problem, theta, start, lin, chosen)
 
-    monkeypatch.setattr("garat_jax.diagnosis.fit.measured_anew", checked)
+    monkeypatch.setattr("garat_jax.diagnosis.descend.measured_anew", checked)
     half = dataclasses.replace(puck, fitted=np.arange(len(puck.fitted)) % 2 == 0)
     misled = settle(half, np.array([0.5]), half.segments.start)
     fit(half, np.array([0.25]), misled.start, (0,), sensitivity=misled.sensitivity)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis import timestep
-from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.differences import clear_differences
+from garat_jax.diagnosis.fit import converge, fit
 from garat_jax.diagnosis.metric import trusted
-from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.starts import follow, settle
 from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.effects import CoggingTorque, ViscousDamping
 from tests.diagnosis import pendulum
@@ -30,6 +31,13 @@ class Finer:
         return self._simulator.predict(theta + self._more, start, segments)
 
 
+def converged(problem, theta):
+    """Fit, to less than noise: what `count_timestep` moves from."""
+    free = tuple(range(len(theta)))
+    found = fit(problem, theta, problem.segments.start, free)
+    return converge(problem, found, clear_differences(problem, found.theta, found.start, free))[0]
+
+
 def test_across_contacts_an_interval_reaches_as_far_as_fits_at_both_timesteps(puck):
     puck = dataclasses.replace(puck, finer=Finer(puck.simulator, 0.01))
     settled = settle(puck, np.array([0.4]), puck.segments.start)
@@ -46,7 +54,7 @@ def test_a_shift_that_does_less_or_more_than_promised_is_not_made(monkeypatch, k
     monkeypatch.setattr(timestep, "_kept_promise", lambda *_: kept)
     recordings = [record(UNIFORM, damping=0.02, noise=1e-5, finer=32)]
     problem = make_problem(recordings, [ViscousDamping("joint/hinge")])
-    found = fit(problem, problem.simulator.base, problem.segments.start, (0,))
+    found = converged(problem, problem.simulator.base)
     counted = count_timestep(problem, found)
     assert bool(counted.theta[0] == found.theta[0]) is stays
     assert counted.low[0] < 0.02 < counted.high[0]
@@ -61,7 +69,7 @@ def test_a_shift_that_does_less_or_more_than_promised_is_not_made(monkeypatch, k
 def test_a_shift_that_explains_no_more_is_not_made(monkeypatch, name, value):
     recordings = [record(UNIFORM, damping=0.02, noise=1e-5, finer=32)]
     problem = make_problem(recordings, [ViscousDamping("joint/hinge")])
-    found = fit(problem, problem.simulator.base, problem.segments.start, (0,))
+    found = converged(problem, problem.simulator.base)
     assert count_timestep(problem, found).theta[0] != found.theta[0]
     monkeypatch.setattr(timestep, name, value)
     counted = count_timestep(problem, found)
@@ -70,19 +78,27 @@ def test_a_shift_that_explains_no_more_is_not_made(monkeypatch, name, value):
         assert counted.low[0] < 0.02 < counted.high[0]
 
 
-def test_steps_are_repeated_where_one_does_not_undo_the_timestep(monkeypatch):
-    amplitude, periods, phase = 0.3, 16.0, 0.4
+def test_what_the_timestep_does_to_three_parameters_is_undone():
+    true = np.asarray([0.3, 16.0, 0.4])
 
     def ripple(angle: float) -> float:
-        return amplitude * np.sin(periods * angle + phase)
+        return true[0] * np.sin(true[1] * angle + true[2])
 
-    recordings = [pendulum.record(lambda spec: None, seed, ripple=ripple) for seed in range(2)]
+    recordings = [
+        pendulum.record(lambda spec: None, seed, ripple=ripple, noise=1e-4) for seed in range(2)
+    ]
     problem = make_problem(recordings, [CoggingTorque("joint/hinge")], timestep=0.004)
-    begin = np.asarray([amplitude, periods, phase])
-    found = fit(problem, begin, problem.segments.start, (0, 1, 2))
+    found = converged(problem, true)
     counted = count_timestep(problem, found)
-    monkeypatch.setattr(timestep, "SHIFTS", 1)
-    one = count_timestep(problem, found)
-    assert one.low[0] > amplitude
-    assert counted.low[0] < amplitude < counted.high[0]
-    assert abs(counted.theta[0] - amplitude) < 0.2 * abs(one.theta[0] - amplitude)
+    assert np.all(counted.low < true) and np.all(true < counted.high)
+    assert np.all(abs(counted.theta - true) < 0.2 * abs(found.theta - true))
+
+
+def test_what_a_fit_stopped_short_of_is_no_error_of_the_timestep():
+    recordings = [record(UNIFORM, damping=0.02, noise=1e-3, finer=32)]
+    problem = make_problem(recordings, [ViscousDamping("joint/hinge")])
+    found = converged(problem, problem.simulator.base)
+    short = follow(problem, found.theta + 2.0 * (found.high - found.low), found)
+    expected = count_timestep(problem, found)
+    counted = count_timestep(problem, short)
+    assert counted.theta[0] == pytest.approx(expected.theta[0], rel=1e-3)
