@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.hidden.bodies import CATALOGUED, SECRETS
 from benchmarks.hidden.generate import (
+    VISIBLE,
     Case,
     Surveys,
     Truth,
@@ -26,6 +27,7 @@ from benchmarks.hidden.secrets import OUTSIDE, SIZES
 from garat_jax.diagnosis import Recording, diagnose, load_model
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
+from garat_jax.effects import CATALOGUE
 
 SCENES = Surveys()
 TIME = np.arange(60) / 200.0
@@ -211,6 +213,14 @@ def test_a_set_is_drawn_from_its_seed_and_reads_as_recordings(tmp_path):
     assert not any(warning for r in recordings for warning in r.warnings)
     written = json.loads((tmp_path / "truth.json").read_text())
     assert written["secrets"][0]["parameters"] == dict(truth.secrets[0].parameters)
+
+
+def test_a_secret_that_is_larger_than_the_catalogue_allows_is_drawn_elsewhere():
+    case = next(c for c in list_cases(5) if c.name == "air_drag-medium")
+    truth = draw(case, SCENES)
+    (drag,) = CATALOGUE["air_drag"].parameters()
+    assert truth.visibility[0] >= VISIBLE
+    assert truth.secrets[0]["coefficient"] <= drag.high
 
 
 @pytest.mark.slow

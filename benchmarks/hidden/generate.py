@@ -12,6 +12,7 @@ import numpy as np
 from scipy import signal
 
 from garat_jax.diagnosis.hidden import write_csv
+from garat_jax.effects import CATALOGUE
 from garat_jax.runs import to_plain
 
 from .bodies import CATALOGUED, SECRETS
@@ -194,12 +195,20 @@ def _place(scene: Scene, eye: Eye, kind: str, size: float, rng) -> tuple[Secret,
     for target in rng.permutation(cls.targets(scene))[:3]:
         name = target.partition("/")[2]
         for enlarged in range(MOST_ENLARGED + 1):
-            parameters = cls.draw(scene, name, size * GROWTH**enlarged, rng)
-            secret = cls(str(target), parameters)
+            secret = cls(str(target), cls.draw(scene, name, size * GROWTH**enlarged, rng))
+            if not _is_sensible(secret):
+                break
             shows = eye.sees((secret,))
             if shows >= VISIBLE:
                 return secret, shows
     return None
+
+
+def _is_sensible(secret: Secret) -> bool:
+    """Say whether a secret lies within the bounds of what a fit may find."""
+    declared = CATALOGUE[secret.kind].parameters() if secret.kind in CATALOGUE else ()
+    known = [(p, secret[p.name]) for p in declared if p.name in secret.parameters]
+    return all(p.low <= value <= p.high for p, value in known)
 
 
 def add_noise(states: np.ndarray, truth: Truth, rng: np.random.Generator) -> np.ndarray:
