@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from garat_jax.diagnosis.alike import alike_as_fitted
 from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.problem import Problem
@@ -76,7 +77,19 @@ def fit_contenders(
         if hopeless and not alike and len(contenders) > 1:
             continue
         contenders.append(_fit(problem, current, score, rival, say))
-    return contenders
+    return contenders + _fit_alike(problem, current, likely, contenders, say)
+
+
+def _fit_alike(problem: Problem, current: Fit, likely, contenders: Sequence[Contender], say):
+    """Fit those that are like the best contender and were not fitted yet: each may be meant."""
+    done = {c.score.effect for c in contenders}
+    best = min(contenders, key=lambda c: c.fit.cost.sum(), default=None)
+    others = [s for s in likely if s.effect not in done]
+    if best is None:
+        return []
+    rival = best.fit.cost[problem.fitted].sum()
+    alike = alike_as_fitted(problem, current, best.score, best.fit, others)
+    return [_fit(problem, current, score, rival, say) for score in alike]
 
 
 def _first_of(likely: Sequence[Score]) -> list[Score]:

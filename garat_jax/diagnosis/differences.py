@@ -95,12 +95,13 @@ def difference_steps(problem: Problem, theta: np.ndarray, columns, relative) -> 
     return np.asarray(steps)
 
 
-def is_erratic(change: np.ndarray, num_signals: int) -> bool:
+def is_erratic(change: np.ndarray, num_signals: int, limit: float = ERRATIC) -> bool:
     """Say whether few samples make a perturbation's change [M]; a flat array of [.., num_signals].
 
-    Each signal is held against its own median: a joint that moves alone is not erratic.
+    Each signal is held against its own median: a joint that moves alone is not erratic. `limit` is
+    the norm of the change, relative to its typical size, from which it is.
     """
-    return bool(ERRATIC * typical_size(change, change, num_signals) < np.linalg.norm(change))
+    return bool(limit * typical_size(change, change, num_signals) < np.linalg.norm(change))
 
 
 def typical_size(values: np.ndarray, change: np.ndarray, num_signals: int) -> float:

@@ -28,6 +28,8 @@ SCREENED = 24
 """Segments that are screened at least, evenly chosen; scores take many simulations each."""
 HEAVY = 0.1
 """Share of all the squared residual from which a segment is screened wherever it lies."""
+ENLARGED = 3
+"""How often a size is enlarged at most that does something else when it is larger."""
 VISIBLE = 3.0
 """Whitened change over a parameter's whole range below which the data cannot show it."""
 WORTHWHILE = 0.01
@@ -69,7 +71,7 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
         fit: The current fit.
         skip: Indices of effects that are in the model already.
     """
-    chosen, weight = _screened(problem, fit)
+    chosen, weight = screened(problem, fit)
     evidence = Evidence(problem, fit, chosen)
     problem = problem.take(chosen)
     weight = np.repeat(weight, len(evidence.residual) // len(chosen))
@@ -93,7 +95,7 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
     return [scores[i] for i in order]
 
 
-def _screened(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+def screened(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Choose fitted segments evenly, and those that hold much of the residual.
 
     An effect that seldom acts, as a limit that is seldom reached, shows in those alone. Each of the
@@ -144,15 +146,17 @@ def _measure(
 
     rows, trials = firsts(problem, theta, skip)
     changes = change(rows)
-    larger = enlarge(problem, rows, trials, changes, residual)
-    if larger:
+    tried = range(len(rows))
+    for _ in range(ENLARGED):
+        larger = enlarge(problem, rows, trials, changes, residual, tried)
+        if not larger:
+            break
         found = change([row for row, _ in larger.values()])
         other = cosines(found, changes[:, list(larger)]) < ALIKE
-        for (index, (row, trial)), new, is_other in zip(
-            larger.items(), found.T, other, strict=True
-        ):
-            if is_other:
-                rows[index], trials[index], changes[:, index] = row, trial, new
+        tried = [index for index, is_other in zip(larger, other, strict=True) if is_other]
+        for index, new in zip(tried, found.T[other], strict=True):
+            rows[index], trials[index] = larger[index]
+            changes[:, index] = new
     num_firsts = len(rows)
     best = best_sizes(trials, weight[:, None] * changes, weight * residual)
     rows, trials = others(simulator, theta, rows, best)

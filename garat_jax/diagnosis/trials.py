@@ -1,5 +1,6 @@
 """What screening simulates: each candidate at one size or several, and each of its parameters."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +9,11 @@ from garat_jax.diagnosis.differences import is_erratic, typical_size
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.simulate import Simulator, columns_of
 
+UNEVEN = 2.5
+"""Norm of a change, relative to its typical size, from which a larger step is tried, too: a sine
+has 1.0, noise 1.5."""
+GROWN = 2.0
+"""Factor by which a larger step must be larger."""
 ROOM = 0.3
 """Share of the way to a bound that a step is enlarged to at most."""
 
@@ -126,6 +132,7 @@ def enlarge(
     trials: list[Trial],
     changes: np.ndarray,
     residual: np.ndarray,
+    tried: Sequence[int],
 ) -> dict[int, tuple[Row, Trial]]:
     """Return larger steps for where a small one changes few samples of a signal much, most hardly.
 
@@ -140,21 +147,24 @@ def enlarge(
         trials: The candidates at their sizes, in the order of the rows.
         changes: What the rows change, [M, rows].
         residual: [M].
+        tried: Indices of the rows for which a larger step is sought.
 
     Returns:
         A row and the trial that starts from it, by the index of those they may replace.
     """
     num_signals, larger = problem.num_signals, {}
-    for index, (row, trial) in enumerate(zip(rows, trials, strict=True)):
-        change = changes[:, index]
-        if not trial.is_only or len(row.values) > 1 or not is_erratic(change, num_signals):
+    for index in tried:
+        row, trial, change = rows[index], trials[index], changes[:, index]
+        if not trial.is_only or len(row.values) > 1:
+            continue
+        if not is_erratic(change, num_signals, UNEVEN):
             continue
         wanted, size = (typical_size(x, change, num_signals) for x in (residual, change))
         p = problem.simulator.slots[row.column].parameter
         base = row.values[row.column] - row.step
         room = abs((p.high if row.step > 0 else p.low) - base)
         step = np.sign(row.step) * min(wanted / size * abs(row.step), ROOM * room)
-        if abs(step) > abs(row.step):
+        if abs(step) > GROWN * abs(row.step):
             start = {row.column: base + step}
             larger[index] = Row(row.column, start, step, -1), trial._replace(start=start)
     return larger

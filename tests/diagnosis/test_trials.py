@@ -36,20 +36,23 @@ def test_steps_grow_where_few_samples_make_the_change():
         for kind in ("viscous_damping", "coulomb_friction")
     )
     changes = np.full((1000, len(rows)), 1e-3)
-    changes[::100, friction] = 10.0
-    larger = enlarge(problem, rows, trials, changes, np.full(1000, 0.5))
+    changes[::100, friction] = 0.03  # three times the norm of the rest
+    every = range(len(rows))
+    larger = enlarge(problem, rows, trials, changes, np.full(1000, 0.5), every)
     assert friction in larger and damping not in larger
     row, trial = larger[friction]
     assert row.step == pytest.approx(500 * rows[friction].step)
     assert row.values[row.column] == pytest.approx(simulator.base[row.column] + row.step)
     assert trial.rows == (friction,)
     assert trial.start == row.values
+    assert friction not in enlarge(problem, rows, trials, changes, np.full(1000, 1.9e-3), every)
+    assert friction not in enlarge(problem, rows, trials, changes, np.full(1000, 0.5), [damping])
     p = simulator.slots[row.column].parameter
-    far, _ = enlarge(problem, rows, trials, changes, np.full(1000, 1e9))[friction]
+    far, _ = enlarge(problem, rows, trials, changes, np.full(1000, 1e9), every)[friction]
     assert far.step == pytest.approx(0.3 * (p.high - p.low))
     changes[:, friction] = np.where(np.arange(1000) % 100, 0.0, 1.0)
     changes[0, friction] = 1e3  # most samples do not change at all
-    rare, _ = enlarge(problem, rows, trials, changes, np.full(1000, 5.0))[friction]
+    rare, _ = enlarge(problem, rows, trials, changes, np.full(1000, 5.0), every)[friction]
     assert rare.step == pytest.approx(5 * rows[friction].step)
 
 
