@@ -6,7 +6,7 @@ what that one does with a further effect.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from garat_jax.diagnosis.contend import Contender, refines
@@ -17,6 +17,7 @@ from garat_jax.diagnosis.judge import (
     Judged,
     do_the_same,
     held_out_gain,
+    is_certain,
     leads,
 )
 from garat_jax.diagnosis.metric import AT_FLOOR, Metric, is_above, noise_floor
@@ -82,9 +83,9 @@ def choose(
 
     Returns:
         The candidates, the first of which passes if with another it leads its rivals with another,
-        or if all that these do not lead add it, too; and what is to be added: the first if it
-        passes, with the other if it needs that and no third explains as much; a next round may
-        tell these.
+        or if all that these do not lead add it, too, or the same beside another first; and what is
+        to be added: the first if it passes, with the other if it needs that and no third explains
+        as much; a next round may tell these.
     """
     followed = []
     for candidate, contender in _rivals(problem, metric, judged)[: 1 + RIVALS]:
@@ -94,25 +95,55 @@ def choose(
         return judged, _first_step(problem, judged, current)
     best = min(followed, key=lambda path: path.fit.cost.sum())
     known = [k.fit for first, k in judged[:1] if k and first.passes]
-    gains = best.second and held_out_gain(problem, metric, current, best.fit).low > 0
+    gains = best.second and is_certain(held_out_gain(problem, metric, current, best.fit))
     if not gains or not all(leads(problem, best.fit, fit) for fit in known):
         return judged, _first_step(problem, judged, current)
     others = [path for path in followed if not best.is_like(path)]
     undecided = [best, *(path for path in others if not leads(problem, best.fit, path.fit))]
-    pairs = [(best.candidate, best.contender), *judged]
-    shared = (pair for pair in pairs if all(path.adds(pair[0].named) for path in undecided))
-    first, contender = next(shared, (best.candidate, None))
-    if contender is None or first.why not in ANOTHER_MAY_HELP:
+    shared = _shared(undecided, judged)
+    if shared is None:
         return judged, _first_step(problem, judged, current)
+    first, contender, is_second = shared
     itself = {first.named, *first.indistinguishable_from}
     added = dict.fromkeys(c.named for path in undecided for c in path.added)
     why = TOGETHER + " or ".join(str(named) for named in added if named not in itself)
     first = dataclasses.replace(first, passes=True, why=why)
     judged = [(first, contender), *(pair for pair in judged if pair[1] is not contender)]
     steps = _first_step(problem, judged, current)
-    if len(undecided) == 1:
+    if len(undecided) == 1 or is_second:
         steps += _first_step(problem, best.then, best.contender.fit)
     return judged, steps
+
+
+def _shared(undecided: Sequence[Path], judged: Judged) -> tuple[Candidate, Contender, bool] | None:
+    """Return what is on all paths, with its fit; where that is the second, what it is second to.
+
+    Args:
+        undecided: The best path and those that it does not lead.
+        judged: The round's candidates, best first.
+
+    Returns:
+        The candidate that is to pass, its fit and whether what the paths share is the best path's
+        second: then the candidate is its first, not told from the others'. None if they share
+        nothing that may pass.
+    """
+
+    def on_all(named: Named) -> bool:
+        return all(path.adds(named) for path in undecided)
+
+    best = undecided[0]
+    for candidate, contender in [(best.candidate, best.contender), *judged]:
+        if contender and on_all(candidate.named):
+            if candidate.why in ANOTHER_MAY_HELP:
+                return candidate, contender, False
+            break
+    second = best.then[0][0]
+    if best.candidate.why not in ANOTHER_MAY_HELP or not on_all(second.named):
+        return None
+    others = (c.named for path in undecided[1:] for c in path.added if not on_all(c.named))
+    alike = dict.fromkeys([*best.candidate.indistinguishable_from, *others])
+    first = dataclasses.replace(best.candidate, indistinguishable_from=tuple(alike))
+    return first, best.contender, True
 
 
 def _rivals(problem: Problem, metric: Metric, judged: Judged) -> list[tuple[Candidate, Contender]]:
@@ -128,8 +159,18 @@ def _rivals(problem: Problem, metric: Metric, judged: Judged) -> list[tuple[Cand
             own = contender.score.effect
             return [(c, k) for c, k in fitted if is_open and refines(problem, own, k.score.effect)]
         if first.why in ANOTHER_MAY_HELP:
-            return [(c, k) for c, k in fitted if c.named not in first.indistinguishable_from]
+            return _one_of_each(fitted)
     return []
+
+
+def _one_of_each(fitted: Sequence[tuple[Candidate, Contender]]):
+    """Leave out those candidates that are like one before them."""
+    kept, like = [], set()
+    for candidate, contender in fitted:
+        if candidate.named not in like:
+            kept.append((candidate, contender))
+            like |= {*candidate.indistinguishable_from}
+    return kept
 
 
 def _first_step(problem: Problem, judged: Judged, current: Fit) -> list[Step]:

@@ -18,6 +18,9 @@ SIGNIFICANCE = 0.01
 """Largest corrected p-value."""
 STABLE = 0.8
 """Share of block resamples in which an effect must be first."""
+NEGLIGIBLE = 0.01
+"""Part of the fall of the held-out error by which a resample may rise: one without any moment at
+which the effect acts shows next to no change."""
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
@@ -168,7 +171,7 @@ def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stabil
         return f"not significant (corrected p = {score.p_value:.2g})"
     if share < SMALLEST_SHARE:
         return f"explains only {100 * share:.1f} % of the residual"
-    if gain.low <= 0:
+    if not is_certain(gain):
         return NO_CERTAIN_GAIN
     if lead <= 0:
         return NO_CERTAIN_LEAD if np.isfinite(lead) else BEHIND
@@ -186,6 +189,11 @@ def held_out_gain(problem: Problem, metric: Metric, before: Fit, after: Fit) -> 
     whole = np.sqrt(costs.sum(axis=1) / count)
     low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [0.025, 0.975])
     return Interval(float(whole[0] - whole[1]), float(low), float(high))
+
+
+def is_certain(gain: Interval) -> bool:
+    """Say whether the held-out error falls for certain."""
+    return gain.estimate > 0 and gain.low > -NEGLIGIBLE * gain.estimate
 
 
 def estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate]:

@@ -31,6 +31,8 @@ from garat_jax.diagnosis.judge import (
     judge,
 )
 from garat_jax.diagnosis.metric import (
+    ABOVE_FLOOR,
+    AT_FLOOR,
     Floor,
     Metric,
     is_above,
@@ -207,6 +209,7 @@ def _round(
     floor: Floor,
     say: Callable[[str], None],
     refinable: Sequence[int] = (),
+    above: float = ABOVE_FLOOR,
 ) -> Judged:
     """Screen the candidates, fit the likely ones and judge them all.
 
@@ -218,8 +221,9 @@ def _round(
         floor: The noise floor.
         say: Told what is being done.
         refinable: Those of them in whose place a refinement may come.
+        above: Multiple of the floor above which candidates are fitted.
     """
-    gap = is_above(problem, metric, current, floor)
+    gap = is_above(problem, metric, current, floor, above)
     scores = screen(problem, current, held)
     contenders = fit_contenders(problem, current, refinable, scores, say) if gap else []
     contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
@@ -232,10 +236,14 @@ def _round(
 
 
 def _follow(problem: Problem, metric: Metric, held, say, contender: Contender) -> Judged:
-    """Return the round that would follow if a contender were added to the effects held."""
+    """Return the round that would follow if a contender were added to the effects held.
+
+    Two that do not lead each other may both make the model adequate: what is still missing beside
+    them tells which it is.
+    """
     effects = [*held, contender.score.effect]
     floor = noise_floor(problem, metric, contender.fit)
-    return _round(problem, metric, contender.fit, effects, floor, say)
+    return _round(problem, metric, contender.fit, effects, floor, say, above=AT_FLOOR)
 
 
 def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:

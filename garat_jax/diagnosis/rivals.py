@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from garat_jax.diagnosis.contend import Contender, fit_further, fit_refinements
-from garat_jax.diagnosis.judge import held_out_gain, leads
+from garat_jax.diagnosis.judge import held_out_gain, is_certain, leads
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.starts import Fit
@@ -20,7 +20,7 @@ def refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Flo
     if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
         return contenders
     rivals = unled(problem, best, contenders)
-    proves_itself = held_out_gain(problem, metric, current, best.fit).low > 0
+    proves_itself = is_certain(held_out_gain(problem, metric, current, best.fit))
     for rival in rivals:
         names = [c for c in contenders if c.fit.residual is rival.fit.residual]
         for name in names:

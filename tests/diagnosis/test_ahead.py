@@ -23,6 +23,7 @@ EFFECTS = [
     CoulombFriction("joint/hinge"),
 ]
 DAMPING, GRAVITY, OFFSET, FRICTION = range(len(EFFECTS))
+PASSES = "passes every gate"
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +33,19 @@ def problem():
     return dataclasses.replace(problem, fitted=fitted)
 
 
-def chosen(problem, second_of_damping: dict[int, float], second_of_gravity: dict[int, float]):
+def chosen(
+    problem,
+    second_of_damping: dict[int, float],
+    second_of_gravity: dict[int, float],
+    why: str = NO_CERTAIN_LEAD,
+):
     """Choose where damping, gravity and an offset explain 20, 19 and 18 % each by itself.
 
     Args:
         problem: What is fitted.
         second_of_damping: What the best effect beside damping leaves of the residual.
         second_of_gravity: And beside gravity. Beside the offset nothing passes.
+        why: What is said of these.
     """
     current = settle(problem, problem.simulator.base, problem.segments.start)
     residual = np.random.default_rng(0).normal(size=current.residual.shape)
@@ -49,8 +56,9 @@ def chosen(problem, second_of_damping: dict[int, float], second_of_gravity: dict
         score = Score(effect, (effect,), (0.1,), {}, 0.9, 1e-9, True, contribution)
         free = (*current.free, effect)
         fit = dataclasses.replace(current, residual=left * residual, free=free)
+        passes = why == PASSES
         law, none = EFFECTS[effect], Interval(0.0, 0.0, 0.0)
-        candidate = Candidate(law.kind, law.target, {}, 0.1, 0.0, 0.0, none, 0.5, (), False, why)
+        candidate = Candidate(law.kind, law.target, {}, 0.1, 0.0, 0.0, none, 0.5, (), passes, why)
         return candidate, Contender(score, fit)
 
     seconds = {DAMPING: second_of_damping, GRAVITY: second_of_gravity}
@@ -59,7 +67,7 @@ def chosen(problem, second_of_damping: dict[int, float], second_of_gravity: dict
         beside = seconds.get(contender.score.effect)
         if beside is None:
             return [pair(DAMPING, 0.8, NO_CERTAIN_GAIN)]
-        return [pair(effect, left, NO_CERTAIN_LEAD) for effect, left in beside.items()]
+        return [pair(effect, left, why) for effect, left in beside.items()]
 
     judged = [
         pair(DAMPING, 0.80, NO_CERTAIN_GAIN),
@@ -90,6 +98,13 @@ def test_what_all_paths_share_that_none_leads_is_added(problem, of_damping, of_g
     assert added == [named(DAMPING)]
     assert first.passes
     assert "torque_offset" in first.why and "gravity_scale" in first.why
+
+
+def test_what_all_paths_have_second_is_added_with_a_first_that_is_not_told_from_the_others(problem):
+    first, added = chosen(problem, {FRICTION: 0.3}, {FRICTION: 0.301}, PASSES)
+    assert added == [named(DAMPING), named(FRICTION)]
+    assert first.passes and first.indistinguishable_from == (named(GRAVITY),)
+    assert first.why == "passes every gate together with coulomb_friction at joint/hinge"
 
 
 def test_nothing_is_added_where_no_path_leads_and_they_share_nothing(problem):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis.contend import Contender
-from garat_jax.diagnosis.judge import judge
+from garat_jax.diagnosis.findings import Interval
+from garat_jax.diagnosis.judge import is_certain, judge
 from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
@@ -32,6 +33,7 @@ def judged(
     p_value: float = 1e-9,
     large: float = 10.0,
     other_noise: bool = False,
+    num_held_out: int | None = None,
 ):
     """Judge two laws that do much the same to a large residual, and leave some of the noise.
 
@@ -42,11 +44,14 @@ def judged(
         p_value: The simpler one's.
         large: What the residual is beside the noise, in its units.
         other_noise: Whether the richer law leaves noise of its own, and was expected to.
+        num_held_out: In how many of the segments that are held out the laws do anything; None: all.
     """
     start = settle(problem, problem.simulator.base, problem.segments.start)
     rng = np.random.default_rng(0)
     noise = rng.normal(size=start.residual.shape)
     wave = large * np.sin(np.arange(noise.size)).reshape(noise.shape)
+    if num_held_out is not None:
+        wave[np.flatnonzero(~problem.fitted)[num_held_out:]] = 0.0
     another = rng.normal(size=noise.shape)
     current = dataclasses.replace(start, residual=noise + wave)
 
@@ -115,3 +120,20 @@ def test_an_equal_of_the_best_that_passes_every_gate_comes_first(problem):
     first, second = judged(problem, 1.75, 2.0, p_value=0.5)
     assert (first.effect, second.effect) == (RICH, SIMPLE)
     assert first.passes and not second.passes
+
+
+@pytest.mark.parametrize(("num_held_out", "passes"), [(1, True), (0, False)])
+def test_a_law_that_seldom_acts_counts_if_it_does_on_what_is_held_out(
+    problem, num_held_out, passes
+):
+    first, *_ = judged(problem, 1.0, 1.0, num_held_out=num_held_out)
+    assert first.held_out_gain.low <= 0
+    assert first.passes == passes
+
+
+def test_a_fall_is_certain_if_no_resample_rises_by_more_than_a_trifle_of_it():
+    assert is_certain(Interval(1.0, 0.1, 2.0))
+    assert is_certain(Interval(1.0, -0.001, 2.0))
+    assert not is_certain(Interval(1.0, -0.1, 2.0))
+    assert not is_certain(Interval(-1.0, -2.0, 0.1))
+    assert not is_certain(Interval(0.0, 0.0, 0.0))
