@@ -197,7 +197,7 @@ def _place(scene: Scene, eye: Eye, kind: str, size: float, rng) -> tuple[Secret,
         for enlarged in range(MOST_ENLARGED + 1):
             secret = cls(str(target), cls.draw(scene, name, size * GROWTH**enlarged, rng))
             if not _is_sensible(secret):
-                break
+                continue
             shows = eye.sees((secret,))
             if shows >= VISIBLE:
                 return secret, shows

@@ -138,9 +138,11 @@ def _shared(undecided: Sequence[Path], judged: Judged) -> tuple[Candidate, Conte
                 return candidate, contender, False
             break
     second = best.then[0][0]
-    if best.candidate.why not in ANOTHER_MAY_HELP or not on_all(second.named):
+    may_pass = second.passes and best.candidate.why in ANOTHER_MAY_HELP
+    if not may_pass or not on_all(second.named):
         return None
-    others = (c.named for path in undecided[1:] for c in path.added if not on_all(c.named))
+    added = (c for path in undecided[1:] for c in path.added)
+    others = (c.named for c in added if second.named not in (c.named, *c.indistinguishable_from))
     alike = dict.fromkeys([*best.candidate.indistinguishable_from, *others])
     first = dataclasses.replace(best.candidate, indistinguishable_from=tuple(alike))
     return first, best.contender, True

@@ -19,7 +19,8 @@ from garat_jax.diagnosis.starts import Fit
 from garat_jax.diagnosis.timestep import count_timestep
 
 CONTENDERS = 4
-"""How many candidates are fitted each round, those that are like the first counted as one."""
+"""How many candidates are fitted each round, those that are like the first counted as one, besides
+those that turn out to be like the best."""
 SAME = 1.0 - 1e-9
 """Cosine of two candidates' changes from which they are one change."""
 FIRM = 2.0

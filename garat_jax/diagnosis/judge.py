@@ -56,7 +56,6 @@ def judge(
         contenders: Those that were fitted.
         floor: The noise floor.
     """
-    gap = is_above(problem, metric, current, floor)
     judged = []
     if contenders:
         costs = _block_costs(problem, 1.0, [c.fit for c in contenders], slice(None))
@@ -79,7 +78,8 @@ def judge(
         judged = [found[best], *(found[i] for i in order if i != best)]
         judged.sort(key=lambda pair: not pair[0].passes and pair[0].stability < STABLE)
     fitted = [c.score.effect for c in contenders]
-    why = "the model's error is near the noise floor" if not gap else "others explain more"
+    is_near = not contenders and not is_above(problem, metric, current, floor)
+    why = "the model's error is near the noise floor" if is_near else "others explain more"
     rest = [score for score in scores if score.effect not in fitted]
     for score in rest:
         sign = "its sign is physically impossible" if not score.possible else why

@@ -71,10 +71,8 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
         fit: The current fit.
         skip: Indices of effects that are in the model already.
     """
-    chosen, weight = screened(problem, fit)
-    evidence = Evidence(problem, fit, chosen)
+    chosen, evidence, weight = gather(problem, fit)
     problem = problem.take(chosen)
-    weight = np.repeat(weight, len(evidence.residual) // len(chosen))
     rows, trials, changes = _measure(problem, fit.theta, evidence, weight, skip)
     raw = [_score(problem, evidence, weight, changes, rows, trial) for trial in trials]
     judged = [score for score in raw if not score.excluded]
@@ -95,7 +93,14 @@ def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> l
     return [scores[i] for i in order]
 
 
-def screened(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+def gather(problem: Problem, fit: Fit) -> tuple[np.ndarray, Evidence, np.ndarray]:
+    """Return which segments to screen [C], what they say, and the weight of each residual [M]."""
+    chosen, weight = _screened(problem, fit)
+    evidence = Evidence(problem, fit, chosen)
+    return chosen, evidence, np.repeat(weight, len(evidence.residual) // len(chosen))
+
+
+def _screened(problem: Problem, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Choose fitted segments evenly, and those that hold much of the residual.
 
     An effect that seldom acts, as a limit that is seldom reached, shows in those alone. Each of the

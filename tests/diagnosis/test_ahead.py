@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from garat_jax.diagnosis import ahead
 from garat_jax.diagnosis.ahead import choose
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Candidate, Interval, Named
@@ -107,7 +108,25 @@ def test_what_all_paths_have_second_is_added_with_a_first_that_is_not_told_from_
     assert first.why == "passes every gate together with coulomb_friction at joint/hinge"
 
 
+def test_what_all_paths_have_second_is_not_added_where_it_does_not_pass(problem):
+    first, added = chosen(problem, {FRICTION: 0.3}, {FRICTION: 0.301}, NO_CERTAIN_LEAD)
+    assert added == []
+    assert not first.passes
+
+
 def test_nothing_is_added_where_no_path_leads_and_they_share_nothing(problem):
     first, added = chosen(problem, {OFFSET: 0.3}, {FRICTION: 0.301})
     assert added == []
     assert not first.passes
+
+
+def test_of_rivals_that_are_alike_one_is_followed():
+    def candidate(effect: int, *equals: int) -> Candidate:
+        law, none = EFFECTS[effect], Interval(0.0, 0.0, 0.0)
+        alike = tuple(named(other) for other in equals)
+        return Candidate(law.kind, law.target, {}, 0.1, 0.0, 0.0, none, 0.5, alike, False, "")
+
+    rivals = [candidate(DAMPING, GRAVITY), candidate(OFFSET, FRICTION)]
+    like_them = [candidate(FRICTION, OFFSET), candidate(GRAVITY, DAMPING)]
+    kept = ahead._one_of_each([(c, None) for c in (*rivals, *like_them)])
+    assert [c for c, _ in kept] == rivals

@@ -1,13 +1,16 @@
 """What contacts do to predictions: small steps that tell nothing, samples that count for little."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from garat_jax.diagnosis.metric import make_metric, trusted
+from garat_jax.diagnosis.screen import _measure
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.trials import enlarge, firsts
+from garat_jax.effects import TorqueOffset
 from tests.diagnosis.test_fit import UNIFORM, candidates, column, make_problem, record
 
 
@@ -74,3 +77,24 @@ def test_samples_that_half_a_timestep_changes_count_less_and_are_reported_as_the
     held_out = ~problem.fitted
     assert weighed.error(again, held_out) == pytest.approx(raw.error(settled.residual, held_out))
     assert np.abs(again).sum() < 0.7 * np.abs(settled.residual).sum()
+
+
+def test_a_step_grows_until_it_stands_out_of_what_contacts_add():
+    """Contacts add an amount to a tenth of the samples that changes with the step, not its size."""
+    problem = make_problem([record(UNIFORM)], [TorqueOffset("joint/hinge")])
+    wave = np.sin(np.arange(1000))
+
+    def change(thetas: np.ndarray) -> np.ndarray:
+        changes = np.outer(wave, thetas[:, 0])
+        for number, torque in enumerate(thetas[:, 0]):
+            noise = np.random.default_rng(int(1e6 * abs(torque))).normal(size=1000)
+            changes[:, number] += np.where(np.arange(1000) % 10, 0.1, 3.0) * noise
+        return changes
+
+    evidence = SimpleNamespace(residual=5.0 * wave, change=change)
+    rows, trials, changes = _measure(problem, np.zeros(1), evidence, np.ones(1000), ())
+    (row,), ((effect, start, _, _),) = rows, trials
+    assert effect == 0
+    assert start == {0: row.step}
+    assert 2.0 < row.step < 10.0
+    assert changes[:, 0] @ wave / np.linalg.norm(changes) / np.linalg.norm(wave) > 0.8
