@@ -12,6 +12,7 @@ import numpy as np
 from garat_jax.diagnosis.alike import alike_as_fitted
 from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.names import is_predicted, renamed, stands_for, twins
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import EQUIVALENT, VISIBLE, Score, cosine, simpler_law
 from garat_jax.diagnosis.simulate import columns_of
@@ -21,8 +22,6 @@ from garat_jax.diagnosis.timestep import count_timestep
 CONTENDERS = 4
 """How many candidates are fitted each round, those that are like the first counted as one, besides
 those that turn out to be like the best."""
-SAME = 1.0 - 1e-9
-"""Cosine of two candidates' changes from which they are one change."""
 FIRM = 2.0
 """Half-widths of its 95 % interval by which a parameter that screening left out must differ from no
 effect, at a timestep of 0, to be fitted in the end."""
@@ -286,12 +285,6 @@ def with_twins(
     return [*contenders, *found]
 
 
-def twins(score: Score, others: Sequence[Score]) -> list[Score]:
-    """Return those of the others that change the very same where screened, at the same sizes."""
-    same = [s for s in others if len(s.size) == len(score.size) and cosine(score, s) > SAME]
-    return [s for s in same if np.allclose(s.size, score.size)]
-
-
 def _as_twin(problem: Problem, current: Fit, twin: Contender, like: Score, score: Score):
     """Return a contender's fit under another name; None if that predicts something else.
 
@@ -315,37 +308,25 @@ def _as_twin(problem: Problem, current: Fit, twin: Contender, like: Score, score
     return Contender(dataclasses.replace(score, columns=columns), fitted)
 
 
-def is_predicted(problem: Problem, fitted: Fit) -> bool:
-    """Say whether a fit that was renamed still predicts what is left of its residual."""
-    predicted = problem.residual_by(problem.simulator, fitted.theta, fitted.start)
-    return np.allclose(predicted, fitted.residual, atol=1e-6)
-
-
-def stands_for(problem: Problem, one: Score, other: Score) -> dict[int, int]:
-    """Return which parameter of another law stands for which of one, by index."""
-    effects, slots = problem.simulator.effects, problem.simulator.slots
-    if effects[one.effect].kind != effects[other.effect].kind:
-        return dict(zip(one.columns, other.columns, strict=True))
-    theirs = columns_of(slots, other.effect)
-    return {j: theirs[name] for name, j in columns_of(slots, one.effect).items()}
-
-
-def renamed(fitted: Fit, old: Sequence[int], new: Sequence[int], without: np.ndarray) -> Fit:
-    """Return a fit whose parameters `old` are called `new`; its residual stays the very array.
+def under_another_name(
+    problem: Problem, fitted: Fit, contender: Contender, other: Contender
+) -> Fit | None:
+    """Return a fit in which a law is called another that had one fit with it when both came up.
 
     Args:
-        fitted: The fit.
-        old: Indices of some parameters.
-        new: Those that get their values.
-        without: Values at which the old ones do nothing, [num_parameters].
+        problem: What is fitted.
+        fitted: The fit with the law, and what was added since.
+        contender: The law as it came up.
+        other: The other law, as it came up.
+
+    Returns:
+        None if the two had fits of their own, or predict something else by now.
     """
-    theta, names = fitted.theta.copy(), dict(zip(old, new, strict=True))
-    theta[list(old)] = without[list(old)]
-    theta[list(new)] = fitted.theta[list(old)]
-    free, frozen = (
-        tuple(names.get(j, j) for j in columns) for columns in (fitted.free, fitted.frozen)
-    )
-    return dataclasses.replace(fitted, theta=theta, free=free, frozen=frozen)
+    if other.fit.residual is not contender.fit.residual:
+        return None
+    names = stands_for(problem, contender.score, other.score)
+    same = renamed(fitted, [*names], [*names.values()], without=problem.simulator.base)
+    return same if is_predicted(problem, same) else None
 
 
 def with_evidence(

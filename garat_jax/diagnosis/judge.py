@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, refines, twins
+from garat_jax.diagnosis.contend import Contender, refines
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
+from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem, block_labels
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
 from garat_jax.diagnosis.starts import Fit

@@ -17,9 +17,7 @@ from garat_jax.diagnosis.contend import (
     Contender,
     complete,
     fit_contenders,
-    is_predicted,
-    renamed,
-    stands_for,
+    under_another_name,
     with_evidence,
     with_twins,
 )
@@ -276,11 +274,10 @@ def _as_shown(problem: Problem, steps: Sequence[Step], final: Fit) -> dict[Named
     shown = {}
     for step in steps:
         for candidate, contender in [(step.candidate, step.contender), *step.alike]:
-            if contender.fit.residual is not step.contender.fit.residual:
-                continue
-            names = stands_for(problem, step.contender.score, contender.score)
-            fit = renamed(final, [*names], [*names.values()], without=problem.simulator.base)
-            if contender is step.contender or is_predicted(problem, fit):
+            fit = final
+            if contender is not step.contender:
+                fit = under_another_name(problem, final, step.contender, contender)
+            if fit is not None:
                 sizes = estimates(problem, contender.score.effect, fit)
                 shown[candidate.named] = dataclasses.replace(candidate, parameters=sizes)
     return shown

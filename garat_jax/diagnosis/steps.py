@@ -9,7 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, as_refined, complete, refines
+from garat_jax.diagnosis.contend import (
+    Contender,
+    as_refined,
+    complete,
+    refines,
+    under_another_name,
+)
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import leads
@@ -105,8 +111,10 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
         trials = []
         for candidate, contender in step.alike:
             if contender.score.effect not in others:
-                say(f"trying {candidate.named} instead of {step.candidate.named}")
-                trial = _fit_instead(problem, fitted, others, contender)
+                trial = under_another_name(problem, fitted, step.contender, contender)
+                if trial is None:
+                    say(f"trying {candidate.named} instead of {step.candidate.named}")
+                    trial = _fit_instead(problem, fitted, others, contender)
                 trials.append((candidate, dataclasses.replace(contender, fit=trial)))
         found[place], fitted = _best_of(problem, metric, step, fitted, trials, say)
     if fitted is current:

@@ -1,5 +1,6 @@
 """What was added gives way to what fits better beside the effects found since."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -10,6 +11,8 @@ from garat_jax.diagnosis.findings import Candidate, Interval, Named
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon
 from garat_jax.diagnosis.metric import make_metric
+from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.names import renamed
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.segments import choose_grid
@@ -24,8 +27,11 @@ from garat_jax.effects import (
     TorqueOffset,
     ViscousDamping,
 )
-from tests.diagnosis.pendulum import MODEL, add_damping, record
+from tests import models
+from tests.diagnosis.pendulum import add_damping, record
 
+SPEC = models.spec(models.PENDULUM.replace("Euler", "implicitfast"))
+MODEL = Model("pendulum", __file__, __file__, SPEC)
 AT = "joint/hinge"
 MOTOR = "actuator/motor"
 EFFECTS = (
@@ -120,6 +126,19 @@ def test_what_cannot_be_told_from_it_beside_the_others_is_named(problem):
     assert [step.effect for step in steps] == [DAMPING, OFFSET]
     assert steps[0].candidate.indistinguishable_from == (Named("back_emf", MOTOR),)
     assert current is before
+
+
+def test_another_name_of_what_was_added_needs_no_fit_of_its_own(problem):
+    own, other, said = contender(problem, DAMPING), contender(problem, EMF), []
+    same = renamed(own.fit, (DAMPING,), (EMF,), without=problem.simulator.base)
+    alike = [(candidate(EMF), dataclasses.replace(other, fit=same))]
+    both = fit_with(problem, DAMPING, OFFSET)
+    later = Step(candidate(OFFSET), contender(problem, OFFSET), both, [])
+    steps = [Step(candidate(DAMPING), own, own.fit, alike), later]
+    found, current = reconsider(problem, make_metric(problem), steps, both, said.append)
+    assert said == []
+    assert found[0].candidate.indistinguishable_from == (Named("back_emf", MOTOR),)
+    assert current is both
 
 
 def test_a_law_goes_where_one_that_refines_it_can_do_what_both_do():
