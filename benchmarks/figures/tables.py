@@ -292,6 +292,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "optimisation_level": optimisation_level,
     "hidden_effects_seed_4": functools.partial(hidden_effects, 4),
     "hidden_effects_seed_5": functools.partial(hidden_effects, 5),
+    "hidden_effects_seed_6": functools.partial(hidden_effects, 6),
     "timing": timing,
     "real_data": real_data,
     "ground": ground,
