@@ -95,6 +95,11 @@ def _verdict(diagnosis: Diagnosis) -> str:
         return f"The model lacks {names}. With it, {fall}."
     if names:
         return f"The model lacks {names}, but that is not all. With it, {fall}: {diagnosis.rest}."
+    if rivals := diagnosis.rivals(label):
+        return (
+            f"Something is missing, but none of {rivals} explains more than the others for "
+            f"certain, and none is added: {diagnosis.rest}."
+        )
     return f"Something is missing that no effect in the catalogue explains: {diagnosis.rest}."
 
 

@@ -17,7 +17,7 @@ from garat_jax.diagnosis.findings import (
     Unseen,
     list_unseen,
 )
-from garat_jax.diagnosis.judge import SMALLEST_SHARE
+from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD, SMALLEST_SHARE
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.metric import ABOVE_FLOOR
 from garat_jax.errors import choose
@@ -230,7 +230,16 @@ class Diagnosis:
             return f"Missing: {names}; {fall}."
         if names:
             return f"Found {names}; {fall}; but {self.rest}."
+        if rivals := self.rivals():
+            return f"None of {rivals} leads for certain, and none is added: {self.rest}."
         return f"Nothing in the catalogue explains the error: {self.rest}."
+
+    def rivals(self, spell: Callable[[Named], str] = str) -> str:
+        """Spell the first candidates that only rivals keep back; empty if there are not several."""
+        held_back = [c.named for c in self.candidates if c.why == NO_CERTAIN_LEAD]
+        if len(held_back) < 2:
+            return ""
+        return ", ".join(spell(named) for named in held_back[:MOST_NAMED])
 
     @property
     def rest(self) -> str:

@@ -9,6 +9,7 @@ import pytest
 from garat_jax.diagnosis import Diagnosis, Recording, figures, load_model
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named, apart
 from garat_jax.diagnosis.hidden import make_recordings
+from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.problem import Problem
@@ -148,6 +149,21 @@ def test_a_gap_in_single_signals_is_not_said_to_be_0_percent_of_the_error():
         "that of qvel.hinge stays well above its noise floor."
     )
     assert diagnosis_facts(diagnosis)[-1].value == "1"
+
+
+def test_rivals_of_which_none_leads_are_named():
+    rival = dataclasses.replace(OFFSET, why=NO_CERTAIN_LEAD)
+    other = dataclasses.replace(rival, effect="motor_gain", target="actuator/motor")
+    several = dataclasses.replace(NOT_ALL, selected=(), candidates=(rival, other, FRICTION))
+    assert several.sentence == (
+        "None of torque_offset at joint/hinge, motor_gain at actuator/motor leads for certain, and "
+        "none is added: 2 % of the error stays unexplained."
+    )
+    assert "none of torque offset at joint/hinge, motor gain at actuator/motor explains" in (
+        diagnosis_lead(several)
+    )
+    single = dataclasses.replace(several, candidates=(rival, FRICTION))
+    assert single.sentence.startswith("Nothing in the catalogue explains the error")
 
 
 def test_a_model_that_is_adequate_in_what_was_fitted_only_is_judged_over_long_segments():
