@@ -83,13 +83,18 @@ def fit_contenders(
 def _fit_alike(problem: Problem, current: Fit, likely, contenders: Sequence[Contender], say):
     """Fit those that are like the best contender and were not fitted yet: each may be meant."""
     done = {c.score.effect for c in contenders}
-    best = min(contenders, key=lambda c: c.fit.cost.sum(), default=None)
-    others = [s for s in likely if s.effect not in done]
+    best = best_of(contenders)
     if best is None:
         return []
+    others = [s for s in likely if s.effect not in done]
     rival = best.fit.cost[problem.fitted].sum()
     alike = alike_as_fitted(problem, current, best.score, best.fit, others)
     return [_fit(problem, current, score, rival, say) for score in alike]
+
+
+def best_of(contenders: Sequence[Contender]) -> Contender | None:
+    """Return the contender that fits best, if there is any."""
+    return min(contenders, key=lambda contender: contender.fit.cost.sum(), default=None)
 
 
 def _first_of(likely: Sequence[Score]) -> list[Score]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from garat_jax.diagnosis.units import after_number
 
 MOST_NAMED = 4
-"""Kinds that a sentence names of those that recordings cannot show."""
+"""Effects that a sentence names at most: of rivals, or of those that recordings cannot show."""
 
 
 @dataclasses.dataclass(frozen=True)

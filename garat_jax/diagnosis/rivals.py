@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from garat_jax.diagnosis.contend import Contender, fit_further, fit_refinements
+from garat_jax.diagnosis.contend import Contender, best_of, fit_further, fit_refinements
 from garat_jax.diagnosis.judge import held_out_gain, is_certain, leads
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
 from garat_jax.diagnosis.problem import Problem
@@ -16,7 +16,7 @@ def refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Flo
     simpler law. A refinement's threshold hides it there; one without waits for the next round,
     where other effects rival it, if the simpler law proves itself and has no rival.
     """
-    best = _best(contenders)
+    best = best_of(contenders)
     if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
         return contenders
     rivals = unled(problem, best, contenders)
@@ -38,7 +38,7 @@ def fill_out(problem, metric: Metric, contenders, floor: Floor, say):
 
     Of two that explain the same, one may be the truth without a part that screening left out.
     """
-    best = _best(contenders)
+    best = best_of(contenders)
     if best is None or not is_above(problem, metric, best.fit, floor, AT_FLOOR):
         return contenders
     for rival in unled(problem, best, contenders):
@@ -53,11 +53,6 @@ def unled(problem: Problem, best: Contender, contenders: Sequence[Contender]) ->
     fits = {id(c.fit.residual): c for c in [*contenders, best]}  # names share one
     others = (c for c in fits.values() if c is not best)
     return [best, *(c for c in others if not leads(problem, best.fit, c.fit))]
-
-
-def _best(contenders: Sequence[Contender]) -> Contender | None:
-    """Return the contender that fits best, if there is any."""
-    return min(contenders, key=lambda contender: contender.fit.cost.sum(), default=None)
 
 
 def _replaced(contenders: Sequence[Contender], old: Contender, new: Contender) -> list[Contender]:
