@@ -11,7 +11,6 @@ from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.held_out import are_explained, errors_of, longest_errors
 from garat_jax.diagnosis.horizon import (
     choose_horizon,
-    cut_longer,
     say_horizon,
     warn_of_divergence,
 )
@@ -82,7 +81,7 @@ def diagnose(
     say("the model as it is")
     settled = settle(problem, simulator.base, segments.start)
     problem = trusted(problem, settled)
-    outcome = explain(problem, settled.start, say, lambda p, t: cut_longer(p, everything, grid, t))
+    outcome = explain(problem, everything, grid, settled.start, say)
     problem = outcome.problem
     warnings += few_segments(problem)
     error = errors_of(problem, (outcome.before, outcome.after), outcome.floor, host, how)

@@ -36,18 +36,20 @@ def choose_horizon(
     """Choose the longest horizon over which fits are nearly linear, and cut there.
 
     Growth is the change of the signals after a small change of the initial state, both relative to
-    the signals' spread; the error is that of the model from the measured initial state, less what
-    noise makes of it, in signals that spread beyond `QUIET` times their noise, if there are any.
+    the signals' spread, if it lasts; the error is that of the model from the measured initial
+    state, less what noise makes of it, in signals that spread beyond `QUIET` times their noise, if
+    there are any.
     """
     horizons = _possible(recordings)
     segments = cut(recordings, grid, horizons[0])
     sample = grid.interval * grid.per_sample
     predicted = _perturbed(simulator, simulator.base, segments)
-    limits = np.stack([_growth(predicted, segments), _error(predicted[0], segments)])
+    growth, error = _growth(predicted, segments), _error(predicted[0], segments)
     horizon = horizons[-1]
     for horizon in horizons:
-        within = limits[:, :, : max(2, round(horizon / sample))].max(axis=2)
-        if all(_is_within(sizes) for sizes in within):
+        length = max(2, round(horizon / sample))
+        grown, wrong = _lasting(growth[:, :length]), error[:, :length].max(axis=1)
+        if _is_within(grown) and _is_within(wrong):
             break
     return horizon, segments if horizon == horizons[0] else cut(recordings, grid, horizon)
 
@@ -130,6 +132,21 @@ def cut_longer(
     return None
 
 
+def cut_ever_longer(
+    problem: AnyProblem, recordings: Sequence[Recording], grid: Grid, theta: np.ndarray
+) -> Iterator[tuple[AnyProblem, Fit]]:
+    """Cut into longer segments, the shortest first, in which small changes do not grow.
+
+    As `cut_longer`, but however much the model errs in them.
+
+    Yields:
+        The problem of longer segments and a fit of their initial states.
+    """
+    everything = np.arange(len(recordings))
+    for longer, _ in [*_predictable(problem, recordings, grid, theta, everything)][::-1]:
+        yield longer, settle(longer, theta, longer.segments.start)
+
+
 def cut_longest(
     problem: Problem, recordings: Sequence[Recording], grid: Grid, theta: np.ndarray
 ) -> Problem | None:
@@ -166,7 +183,7 @@ def _predictable(
         segments = segments.take(np.isin(segments.recording, chosen))
         if segments.measured.shape[1] <= problem.segments.measured.shape[1]:
             break
-        growth = _growth(_perturbed(problem.simulator, theta, segments), segments).max(axis=1)
+        growth = _lasting(_growth(_perturbed(problem.simulator, theta, segments), segments))
         if _is_within(growth):
             seen = np.isin(segments.recording, fitted)
             yield dataclasses.replace(problem, segments=segments, fitted=seen), growth
@@ -197,6 +214,14 @@ def _growth(predicted: np.ndarray, segments: Segments) -> np.ndarray:
     by_size = zip(np.split(change, len(PERTURBATIONS)), PERTURBATIONS, strict=True)
     growth = np.min([_or_inf(part.max(axis=(0, 3)) / size) for part, size in by_size], axis=0)
     return growth / LARGEST_GROWTH
+
+
+def _lasting(growth: np.ndarray) -> np.ndarray:
+    """Return the largest growth [S, L] in the second half of each segment, [S].
+
+    A stiff servo answers a small push with a fast motion that soon dies out, and fits stay linear.
+    """
+    return growth[:, growth.shape[1] // 2 :].max(axis=1)
 
 
 def _gone(

@@ -7,7 +7,7 @@ runner-up, each with a block-bootstrap interval, and stability over block resamp
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,11 +23,13 @@ from garat_jax.diagnosis.contend import (
 )
 from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.horizon import cut_ever_longer, cut_longer
 from garat_jax.diagnosis.judge import (
     Judged,
     estimates,
     judge,
 )
+from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import (
     ABOVE_FLOOR,
     AT_FLOOR,
@@ -36,11 +38,13 @@ from garat_jax.diagnosis.metric import (
     is_above,
     make_metric,
     noise_floor,
+    signals_mostly_above,
     trusted,
 )
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rivals import fill_out, refine
 from garat_jax.diagnosis.screen import screen
+from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle, settle_twice
 from garat_jax.diagnosis.steps import Step, prune, reconsider, refitted
 from garat_jax.diagnosis.timestep import count_timestep
@@ -100,19 +104,22 @@ class Selection(NamedTuple):
 
 def explain(
     problem: Problem,
+    recordings: Sequence[Recording],
+    grid: Grid,
     start: np.ndarray,
     say: Callable[[str], None],
-    cut_longer: Callable[[Problem, np.ndarray], tuple[Problem, Fit] | None],
 ) -> Outcome:
     """Add effects as long as one passes every gate.
 
+    A small effect may show only in longer segments, beside a large one or in a model that is
+    adequate within shorter ones.
+
     Args:
-        problem: The recordings and the model with every candidate.
+        problem: The recordings, cut, and the model with every candidate.
+        recordings: What was measured.
+        grid: The simulated steps.
         start: Initial states to start from, [S, nq + nv].
         say: Told what is being done.
-        cut_longer: Cuts again for parameters with which the model can be followed for longer; see
-            `horizon.cut_longer`. A small effect may show only there, in a model that is adequate
-            within shorter segments or beside a large one.
     """
     before = settle(problem, problem.simulator.base, start)
     metric = make_metric(problem)
@@ -120,13 +127,13 @@ def explain(
     adequate = not is_above(problem, metric, before, floor)
     found = _select(problem, before, floor, [], say)
     candidates = found.candidates
-    while (found.steps or adequate) and (longer := cut_longer(found.problem, found.fit.theta)):
-        again = _go_on(found, *longer, say)
-        if again is None:
+    while found.steps or adequate:
+        further = _on_longer(found, recordings, grid, say)
+        if further is None:
             break
-        candidates = candidates if found.steps else again.candidates
-        found = again
-        before = settle(found.problem, found.problem.simulator.base, longer[1].start)
+        candidates = candidates if found.steps else further.candidates
+        found, adequate = further, False
+        before = settle(found.problem, found.problem.simulator.base, found.fit.start)
     problem, steps, current = found.problem, found.steps, found.fit
     if steps:
         current = settle_twice(problem, found.timeless or count_timestep(problem, current))
@@ -151,18 +158,42 @@ def explain(
     )
 
 
-def _go_on(found: Selection, longer: Problem, settled: Fit, say) -> Selection | None:
-    """Go on with longer segments; return None if nothing more is found there."""
-    longer = trusted(longer, settled)
-    say(f"following the recordings for {longer.horizon:.2g} s at a time")
-    current = fit(longer, found.fit.theta, settled.start, found.fit.free)
-    floor = noise_floor(longer, make_metric(longer), current)
-    if not is_above(longer, make_metric(longer), current, floor):
-        return None
-    again = _select(longer, current, floor, found.steps, say)
-    if {step.effect for step in again.steps} <= {step.effect for step in found.steps}:
-        return None
-    return again._replace(steps=refitted(longer, again.steps, again.fit))
+def _on_longer(
+    found: Selection, recordings: Sequence[Recording], grid: Grid, say: Callable[[str], None]
+) -> Selection | None:
+    """Go on with longer segments; return None if they show nothing more.
+
+    Where nothing was found yet, because the model is adequate within short segments, it is followed
+    for longer whatever its error there, until it errs in most segments: what that is, is to be
+    found, or stays unexplained.
+    """
+    had = {step.effect for step in found.steps}
+    for longer, settled in _longer_cuts(found, recordings, grid):
+        longer = trusted(longer, settled)
+        say(f"following the recordings for {longer.horizon:.2g} s at a time")
+        current = fit(longer, found.fit.theta, settled.start, found.fit.free)
+        metric = make_metric(longer)
+        floor = noise_floor(longer, metric, current)
+        if not is_above(longer, metric, current, floor):
+            continue
+        again = _select(longer, current, floor, found.steps, say)
+        if {step.effect for step in again.steps} - had:
+            return again._replace(steps=refitted(longer, again.steps, again.fit))
+        if not had and np.any(signals_mostly_above(longer, metric, current, floor)):
+            return again
+    return None
+
+
+def _longer_cuts(
+    found: Selection, recordings: Sequence[Recording], grid: Grid
+) -> Iterator[tuple[Problem, Fit]]:
+    """Yield longer segments, each with initial states fitted; see `_on_longer`."""
+    how = recordings, grid, found.fit.theta
+    longer = cut_longer(found.problem, *how)
+    if longer:
+        yield longer
+    if not found.steps:
+        yield from cut_ever_longer(longer[0] if longer else found.problem, *how)
 
 
 def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step], say) -> Selection:

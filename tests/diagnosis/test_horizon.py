@@ -17,6 +17,8 @@ from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.velocity import estimate_velocity
+from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE, MotorGain
 from garat_jax.errors import UserError
 from tests.diagnosis.pendulum import MODEL, record
@@ -130,6 +132,59 @@ def test_a_small_effect_is_found_that_a_large_one_hid():
     assert gain.parameters["scale"].estimate == pytest.approx(GAIN, rel=0.01)
     assert offset.parameters["torque"].estimate == pytest.approx(PULL, rel=0.05)
     assert f"+ torque_offset at joint/hinge ({offset.sizes}): fit " in str(found)
+
+
+def test_what_recordings_held_out_show_in_longer_segments_alone_is_found():
+    """They have no velocities: within 0.2 s they agree with a model that errs in the others."""
+
+    def weaken_much(spec: mujoco.MjSpec) -> None:
+        (motor,) = spec.actuators
+        motor.gear = np.asarray(motor.gear) * 0.3
+
+    model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
+    *recordings, last = (record(weaken_much, seed, noise=0.02) for seed in range(4))
+    speed = estimate_velocity(native_model(model.compile()), last.time, last.qpos)
+    last = dataclasses.replace(last, qvel=speed, velocity_measured=False)
+    grid = choose_grid(recordings, 0.002)
+    assert choose_horizon(Simulator(model, (), grid), recordings, grid)[0] == 0.2
+    found = diagnose(model, recordings, [last])
+    assert found.verdict == "missing_effect"
+    assert found.error.horizon > 0.25
+    (gain,) = found.selected
+    assert gain.parameters["scale"].estimate == pytest.approx(0.3, rel=0.03)
+
+
+SERVO = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body>
+      <joint name="hinge" axis="0 0 1" armature="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.1"/>
+    </body>
+  </worldbody>
+  <actuator><position name="servo" joint="hinge" kp="50" kv="3"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_stiff_servo_does_not_shorten_segments():
+    """A push of its angle is answered by a fast motion, beside slow ones, that soon dies out."""
+    spec = mujoco.MjSpec.from_string(SERVO)
+    model = spec.compile()
+    data, states, time = mujoco.MjData(model), [], np.arange(2000) * 0.004
+    ctrl = np.sin(time)
+    for command in ctrl:
+        states.append([*data.qpos, *data.qvel])
+        data.ctrl[0] = command
+        mujoco.mj_step(model, data, 2)
+    noise = np.random.default_rng(0).normal(size=(2000, 2)) * [1e-4, 1e-3]
+    qpos, qvel = np.split(np.asarray(states) + noise, 2, axis=1)
+    spans = ((0, len(time)),)
+    recording = Recording("slow", time, qpos, qvel, ctrl[:, None], {}, True, spans, ())
+    grid = choose_grid([recording], 0.002)
+    simulator = Simulator(Model("servo", __file__, __file__, spec), (), grid)
+    assert choose_horizon(simulator, [recording], grid)[0] == 2.0
 
 
 SLIDER = """
