@@ -83,7 +83,7 @@ def test_the_page_on_python_runs(tmp_path, monkeypatch, capsys):
         exec(snippet, names)
     printed = capsys.readouterr().out
     for said in (
-        "times what noise alone would make",
+        "times what noise and the integrator alone make",
         "Missing: coulomb_friction at joint/hinge",
         "coulomb_friction at joint/hinge torque 0.0",  # the estimates, one by one
         "coulomb_friction at joint/hinge:\ntorque = 0.0",

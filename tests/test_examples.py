@@ -18,7 +18,7 @@ def run(name):
 
 def test_compare(capsys):
     names = run("01_compare.py")
-    assert "times what noise alone would make" in capsys.readouterr().out
+    assert "times what noise and the integrator alone make" in capsys.readouterr().out
     assert isinstance(names["figure"], go.Figure)
     assert "pendulum" in names["comparison"].model
     assert names["comparison"]._repr_html_().startswith("<pre>The model&#x27;s error is")

@@ -17,7 +17,7 @@ from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_div
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.metric import make_metric, noise_floor
+from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, check_same_machine, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import tell
@@ -99,8 +99,8 @@ class Comparison:
         if self.near_noise:
             return f"The model is near the sensors' noise: its error is {size}."
         worst = [f"Most goes wrong at {p.signal}, {p.regime}." for p in self.where[:1]]
-        ratio = error.before / error.noise_floor
-        said = f"The model's error is {size}, {ratio:.2g} times what noise alone would make."
+        times = f"{error.before / error.noise_floor:.2g} times"
+        said = f"The model's error is {size}, {times} what noise and the integrator alone make."
         return " ".join([said, *worst])
 
     def __str__(self) -> str:
@@ -257,6 +257,8 @@ def _errors(played: Replay, simulator: Simulator, finer: Simulator, grid: Grid) 
     problem = Problem(simulator, finer, segments, nothing, grid.interval * grid.per_sample)
     metric = make_metric(problem)
     floor = noise_floor(problem, metric, settle(problem, simulator.base, segments.start))
+    by_noise = dict(zip(played.sizes(), floor.rms.tolist(), strict=True))
+    per_signal = {name: _signal(size, by_noise[name]) for name, size in played.sizes().items()}
     return Errors.above(
         floor.error,
         metric.of_noise(~nothing),
@@ -266,10 +268,12 @@ def _errors(played: Replay, simulator: Simulator, finer: Simulator, grid: Grid) 
         before=played.error(),
         after=played.error(),
         timestep=grid.timestep,
-        per_signal={
-            name: _signal(size, float(by_noise))
-            for (name, size), by_noise in zip(played.sizes().items(), floor.by_signal, strict=True)
-        },
+        per_signal=per_signal,
+        above_floor=tuple(
+            name
+            for name, size in played.sizes().items()
+            if size.rmse > ABOVE_FLOOR * size.noise * by_noise[name]
+        ),
     )
 
 

@@ -44,16 +44,33 @@ class Named:
 
 @dataclasses.dataclass(frozen=True)
 class Unseen(Named):
-    """An effect that the recordings cannot show, and its parameters."""
+    """An effect that the recordings cannot show, up to a size.
+
+    Attributes:
+        parameters: Its parameters' names.
+        up_to: Change of the first parameter, from no effect, below which it stays hidden; infinite
+            if all that its bounds allow does, or if the law has a threshold.
+        unit: That parameter's unit.
+    """
 
     parameters: tuple[str, ...]
+    up_to: float
+    unit: str
+
+    @property
+    def size(self) -> str:
+        """Up to which size it stays hidden, in words; empty if at any."""
+        known = math.isfinite(self.up_to)
+        return f"less than {self.up_to:.2g}{after_number(self.unit)}" if known else ""
 
 
 def list_unseen(unseen: Sequence[Unseen], most: int | None = None) -> str:
     """Return effects, by kind and with their parameters, in words; the first `most` kinds."""
     places: dict[str, list[str]] = {}
     for one in unseen:
-        places.setdefault(f"{one.effect} ({', '.join(one.parameters)})", []).append(one.target)
+        size = f" ({one.size})" if one.size else ""
+        what = f"{one.effect} ({', '.join(one.parameters)})"
+        places.setdefault(what, []).append(f"{one.target}{size}")
     named = [f"{what} at {' and '.join(at)}" for what, at in places.items()]
     more = named[most:] if most is not None else []
     return ", ".join(named[:most]) + (f" and {len(more)} more" if more else "")

@@ -42,25 +42,14 @@ def errors_of(
         above: Which signals count as well above their floor, [num_signals].
     """
     metric, held_out = make_metric(problem), ~problem.fitted
-    segments = problem.segments
-    shape = (-1, *segments.measured.shape[1:])
-    listed = signals(host)
-    per_signal = {}
-    for i in range(shape[-1]):
-        sampled = segments.counts[held_out][..., i] > 0
-        if not sampled.any():
-            continue
-        before, after = (
-            float(np.sqrt(np.mean(residual.reshape(shape)[sampled][:, i] ** 2)))
-            for residual in (fit.residual[held_out] / metric.trust[held_out] for fit in fits)
-        )
-        noise = float(segments.noise[i])
-        per_signal[listed[i].name] = {
-            "before": before * noise,
-            "after": after * noise,
-            "noise_floor": noise,
-            "unit": listed[i].unit,
-        }
+    noise, listed = problem.segments.noise, signals(host)
+    sizes = [*(metric.rms(fit.residual, held_out) for fit in fits), floor.rms]
+    named = ("before", "after", "noise_floor")
+    per_signal = {
+        signal.name: {**dict(zip(named, of_signal.tolist(), strict=True)), "unit": signal.unit}
+        for signal, of_signal in zip(listed, np.stack(sizes, axis=1) * noise[:, None], strict=False)
+        if np.all(np.isfinite(of_signal))
+    }
     loud = np.flatnonzero(above(problem, metric, fits[1], floor))
     before, after = (metric.error(fit.residual, held_out) for fit in fits)
     return Errors.above(

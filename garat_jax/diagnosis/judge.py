@@ -83,9 +83,16 @@ def judge(
     why = "the model's error is near the noise floor" if is_near else "others explain more"
     rest = [score for score in scores if score.effect not in fitted]
     for score in rest:
-        sign = "its sign is physically impossible" if not score.possible else why
-        judged.append((_unfitted(problem, score, rest, score.excluded or sign), None))
+        reason = score.excluded or (why if score.possible else _impossible(problem, score))
+        judged.append((_unfitted(problem, score, rest, reason), None))
     return judged
+
+
+def _impossible(problem: Problem, score: Score) -> str:
+    """Say why what a score expects is physically impossible."""
+    parameter = problem.simulator.slots[score.columns[0]].parameter
+    beyond = score.size[0] > parameter.high or score.size[0] < parameter.low < parameter.nominal
+    return "the size it would need is beyond its bounds" if beyond else "its sign is impossible"
 
 
 def _alike(

@@ -45,6 +45,17 @@ class Metric(NamedTuple):
         """Return the error that noise alone makes in chosen segments."""
         return self.error(self.counted * self.trust, chosen)
 
+    def rms(self, residual: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """Return the error of each signal in units of its noise, all samples alike [num_signals].
+
+        Not a number where no sample was measured.
+        """
+        num_signals = len(self.spread)
+        squares = (residual[chosen] / self.trust[chosen]) ** 2 * self.counted[chosen]
+        count = self.counted[chosen].reshape(-1, num_signals).sum(axis=0)
+        total = squares.reshape(-1, num_signals).sum(axis=0)
+        return np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
     def by_signal(self, residual: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Return the error of each signal in units of its noise, as trusted, [num_signals]."""
         num_signals = len(self.spread)
@@ -100,11 +111,13 @@ class Floor(NamedTuple):
 
     Attributes:
         error: In the metric.
-        by_signal: In units of each signal's noise, [num_signals].
+        by_signal: In units of each signal's noise, as trusted, [num_signals].
+        rms: The same, all samples alike, [num_signals].
     """
 
     error: float
     by_signal: np.ndarray
+    rms: np.ndarray
 
 
 def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
@@ -114,6 +127,7 @@ def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
     return Floor(
         float(np.hypot(metric.of_noise(held_out), metric.error(change, held_out))),
         np.hypot(1.0, metric.by_signal(change, held_out)),
+        np.hypot(1.0, metric.rms(change, held_out)),
     )
 
 

@@ -81,7 +81,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
     if error.is_too_coarse:
         return error.coarseness
     names = " and ".join(c.with_alike(label) for c in diagnosis.selected)
-    floor = f"noise alone makes {_percent(error.noise_floor)}"
+    floor = f"noise and the integrator alone make {_percent(error.noise_floor)}"
     if diagnosis.verdict == "adequate":
         return (
             "The model is adequate: on recordings held out its error is "
@@ -112,7 +112,7 @@ def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     return [
         Fact(_percent(error.before), f"error of the model as it is{over}, of each signal's spread"),
         Fact(_percent(error.after), f"error{over} with the effects that were found"),
-        Fact(_percent(error.noise_floor), "noise floor: what noise alone would make"),
+        Fact(_percent(error.noise_floor), "noise floor: what noise and the integrator alone make"),
         rest,
     ]
 
@@ -160,7 +160,7 @@ def write_comparison(
     error, view = comparison.error, look(model, recordings, range(len(recordings)))
     facts = [
         Fact(_percent(error.before), "error, of each signal's spread"),
-        Fact(_percent(error.noise_floor), "noise floor: what noise alone would make"),
+        Fact(_percent(error.noise_floor), "noise floor: what noise and the integrator alone make"),
         Fact(str(len(recordings)), "recordings"),
     ]
     return report.write(
@@ -202,7 +202,8 @@ def _errors(error: Errors, view: View) -> Section:
         )
         for name, row in error.per_signal.items()
     ]
-    columns = ["signal", "unit", "model as it is", *(["repaired"] if view.after else []), "noise"]
+    repaired = ["repaired"] if view.after else []
+    columns = ["signal", "unit", "model as it is", *repaired, "noise floor"]
     sizes = [p.sizes() for p in after or before]
     by_horizon = [
         (name, size.unit, *(s[name].rmse for s in sizes)) for name, size in sizes[0].items()
@@ -219,13 +220,18 @@ def _errors(error: Errors, view: View) -> Section:
         figures=[
             Figure(
                 figures.errors_by_horizon(before, after, error.noise_floor),
-                f"Error {over} against how far ahead is predicted. At the dotted line the sensors' "
-                "noise alone is left.",
+                f"Error {over} against how far ahead is predicted. At the dotted line the noise "
+                "of the sensors and the integrator's error alone are left.",
                 "Error by horizon",
             )
         ],
         tables=[
-            Table(columns, stated, "Root mean square error of each signal, in its own unit."),
+            Table(
+                columns,
+                stated,
+                "Root mean square error of each signal, in its own unit. The noise floor is what "
+                "the sensors' noise and the integrator's error alone would make.",
+            ),
             Table(
                 ["signal", "unit", *(f"{p.horizon:g} s" for p in view.before)],
                 by_horizon,

@@ -243,13 +243,16 @@ def unseen_section(unseen: Sequence[Unseen]) -> list[Section]:
     """Return which effects the recordings cannot show; nothing if they show all."""
     if not unseen:
         return []
-    rows = [(one.effect.replace("_", " "), one.target, ", ".join(one.parameters)) for one in unseen]
+    rows = [
+        (words(one.effect), one.target, ", ".join(one.parameters), one.size or "any")
+        for one in unseen
+    ]
     text = (
-        "An effect of these kinds and places, of a usual size, would change the signals by less "
-        "than their noise hides. That none was found does not say that there is none: record "
-        "motions in which it acts."
+        "An effect of these kinds and places would change the signals by less than their noise "
+        "hides, up to the size that is given, of the first parameter. That none was found does not "
+        "say that there is none: record motions in which it acts."
     )
-    table = Table(["effect", "place", "parameters"], rows)
+    table = Table(["effect", "place", "parameters", "hidden"], rows)
     return [Section("What these recordings cannot show", text, tables=[table])]
 
 
@@ -317,7 +320,7 @@ def side_by_side_section(comparison: "Comparison") -> list[Section]:
                 Figure(
                     comparison.plot(),
                     "Error against the horizon of the prediction, as a share of the signals' "
-                    "spread. Dotted: what noise alone would make.",
+                    "spread. Dotted: what noise and the integrator alone would make.",
                 )
             ],
             tables=[

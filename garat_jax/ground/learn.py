@@ -66,14 +66,14 @@ class Grounded:
             return (
                 "No update of the action transformer follows the recordings better than the model "
                 "does, which stays as it is: its held-out error is "
-                f"{100 * self.comparison.error.before:.3g} % of the signals' spread; noise alone "
-                f"makes {100 * self.comparison.error.noise_floor:.2g} %."
+                f"{100 * self.comparison.error.before:.3g} % of the signals' spread; the noise "
+                f"floor is {100 * self.comparison.error.noise_floor:.2g} %."
             )
         before, after = self.comparison.error.before, self.comparison.also[0].error
         verb, use = ("falls", "") if after < before else ("rises", " The model is better without.")
         return (
             f"With the action transformer the held-out error {verb} from {100 * before:.3g} % to "
-            f"{100 * after:.3g} % of the signals' spread; noise alone makes "
+            f"{100 * after:.3g} % of the signals' spread; the noise floor is "
             f"{100 * self.comparison.error.noise_floor:.2g} %.{use}"
         )
 

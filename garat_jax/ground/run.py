@@ -126,7 +126,10 @@ def _write_report(run: RunDirectory, done: Grounded, name: str) -> None:
         facts=[
             Fact(f"{100 * comparison.error.before:.3g} %", "held-out error of the model as it is"),
             Fact(f"{100 * comparison.also[0].error:.3g} %", "with the action transformer"),
-            Fact(f"{100 * comparison.error.noise_floor:.2g} %", "what noise alone would make"),
+            Fact(
+                f"{100 * comparison.error.noise_floor:.2g} %",
+                "what noise and the integrator alone make",
+            ),
             Fact(str(summary["transitions"]), "recorded control steps to learn from"),
         ],
         sections=[

@@ -242,7 +242,11 @@ def test_page_of_an_unexplained_gap_says_what_is_left_and_offers_to_learn_it(tmp
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({}, "falls from 20 % to 1.1 % of the signals' spread; noise alone makes 1 %."),
+        (
+            {},
+            "falls from 20 % to 1.1 % of the signals' spread; "
+            "noise and the integrator alone make 1 %.",
+        ),
         (
             {"verdict": "unexplained"},
             "these recordings cannot tell), but that is not all",

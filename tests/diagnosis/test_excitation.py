@@ -8,13 +8,15 @@ import pytest
 from garat_jax import cli
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.diagnose import make_candidates
+from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.findings import Named
 from garat_jax.diagnosis.model_card import load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.segments import choose_grid, cut
-from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.simulate import Simulator, columns_of
 from garat_jax.diagnosis.starts import settle
-from garat_jax.diagnosis.unseen import unseen
+from garat_jax.diagnosis.unseen import SEEN, unseen
+from garat_jax.effects import CATALOGUE
 from tests import models
 
 
@@ -64,7 +66,8 @@ def test_a_comparison_with_still_recordings_says_that_it_means_little(still, tmp
     assert "warning: the recordings excite nothing" in capsys.readouterr().out
 
 
-def test_an_effect_that_explains_much_is_not_called_unseen(still):
+@pytest.fixture(scope="module")
+def at_rest(still):
     path, files = still
     model = load_model(path)
     recordings = read_recordings(model, files)
@@ -73,9 +76,28 @@ def test_an_effect_that_explains_much_is_not_called_unseen(still):
     segments = cut(recordings, grid, 0.5)
     everywhere = np.ones(len(segments.start), bool)
     problem = Problem(simulator, simulator, segments, everywhere, grid.interval)
-    settled = settle(problem, simulator.base, segments.start)
-    damping = Named("viscous_damping", "joint/hinge")
-    hidden = {Named(one.effect, one.target) for one in unseen(problem, settled)}
-    assert damping in hidden
-    seen = unseen(problem, settled, {damping})
-    assert {Named(one.effect, one.target) for one in seen} == hidden - {damping}
+    return problem, settle(problem, simulator.base, segments.start)
+
+
+def test_an_effect_that_explains_much_is_not_called_unseen_nor_what_refines_it(at_rest):
+    dry = Named("coulomb_friction", "joint/hinge")
+    hidden = {Named(one.effect, one.target) for one in unseen(*at_rest)}
+    assert {dry, Named("stribeck_friction", "joint/hinge")} <= hidden
+    left = {Named(one.effect, one.target) for one in unseen(*at_rest, {dry})}
+    finer = {kind for kind, law in CATALOGUE.items() if "coulomb_friction" in law.refines}
+    assert left == {n for n in hidden if n != dry and n.effect not in finer}
+
+
+def test_an_effect_is_hidden_up_to_the_size_that_is_said(at_rest):
+    problem, settled = at_rest
+    sized = [one for one in unseen(problem, settled) if np.isfinite(one.up_to)]
+    assert sized
+    evidence = Evidence(problem, settled, np.flatnonzero(problem.fitted))
+    places = [(effect.kind, effect.target) for effect in problem.simulator.effects]
+    for one in sized:
+        slots = columns_of(problem.simulator.slots, places.index((one.effect, one.target)))
+        first = next(iter(slots.values()))
+        thetas = np.tile(settled.theta, (2, 1))
+        thetas[:, first] += [0.45 * one.up_to, 1.001 * one.up_to]
+        below, above = np.linalg.norm(evidence.change(thetas), axis=0)
+        assert below < SEEN < above, one
