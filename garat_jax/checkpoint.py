@@ -54,7 +54,7 @@ def restore(directory: str | Path, like: State, step: int | None = None) -> Stat
 
     Raises:
         ValueError: There is no such checkpoint.
-        UserError: It is of a state of another structure.
+        UserError: It is of a state of another structure, or damaged.
     """
     newest = latest_step(directory)
     if newest is None:
@@ -66,8 +66,11 @@ def restore(directory: str | Path, like: State, step: int | None = None) -> Stat
             raise ValueError(f"no checkpoint of step {step} in {directory}; it holds: {known}")
         templates = {name: _to_array(leaf) for name, leaf in _named_leaves(like).items()}
         expected = {name: array for name, array in templates.items() if array.size}
-        _check_structure(manager.item_metadata(step), expected, directory)
-        stored = manager.restore(step, args=ocp.args.StandardRestore(expected))
+        _check_structure(_metadata(manager, step, directory), expected, directory)
+        try:
+            stored = manager.restore(step, args=ocp.args.StandardRestore(expected))
+        except Exception as error:  # whatever a damaged file leads Orbax to
+            raise _damaged(directory, error) from error
     leaves = [
         _from_array(stored.get(name, templates[name]), leaf)
         for name, leaf in _named_leaves(like).items()
@@ -88,6 +91,25 @@ def _manager(directory: str | Path, keep: int | None = None) -> ocp.CheckpointMa
     options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=False)
     handler = ocp.StandardCheckpointHandler()
     return ocp.CheckpointManager(Path(directory).resolve(), item_handlers=handler, options=options)
+
+
+def _metadata(manager: ocp.CheckpointManager, step: int, directory: str | Path) -> Any:
+    """Return what a checkpoint says that it holds."""
+    try:
+        metadata = manager.item_metadata(step)
+        if not hasattr(metadata, "items"):
+            raise ValueError("it holds nothing")
+    except Exception as error:  # whatever a damaged file leads Orbax to
+        raise _damaged(directory, error) from error
+    return metadata
+
+
+def _damaged(directory: str | Path, error: Exception) -> UserError:
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return UserError(
+        f"the checkpoint in {directory} is damaged ({reason}); remove that folder's newest step, "
+        "or start anew with --force"
+    )
 
 
 def _named_leaves(state: Any) -> dict[str, Any]:

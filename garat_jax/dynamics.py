@@ -17,6 +17,7 @@ from flax import struct
 
 from garat_jax._mjx import mjx
 from garat_jax.effects.base import Effect, ModelView
+from garat_jax.effects.bounds import check_bounds
 from garat_jax.engine import HostModel
 from garat_jax.errors import UserError, unknown_name
 from garat_jax.mjx_model import put_model, with_fields
@@ -86,8 +87,8 @@ def compile(
         engine: `mjx`, `mujoco`, or `auto`: C MuJoCo on a CPU and MJX elsewhere.
 
     Raises:
-        UserError: An override or effect does not fit the model, or the engine cannot step it or
-            would ignore a part of it.
+        UserError: An override or effect does not fit the model, a parameter is outside its bounds,
+            or the engine cannot step the model or would ignore a part of it.
     """
     if engine not in ENGINES:
         raise unknown_name("engine", engine, ENGINES)
@@ -97,7 +98,9 @@ def compile(
     for override in overrides:
         override.apply(spec)
     for effect in effects:
-        effect.check(spec.copy().compile())
+        bare = spec.copy().compile()
+        effect.check(bare)
+        check_bounds(effect, bare)
         effect.unlock(spec)
         effect.prepare(spec)
     try:

@@ -54,7 +54,8 @@ class RunDirectory:
 
         Args:
             path: The folder; its parents are made as needed.
-            config: A dataclass or mapping with the settings that decide the results.
+            config: A dataclass or mapping with the settings that decide the results; what is
+                infinite becomes null, because JSON has no infinity.
             command: The command line that started the run.
             seeds: The seeds of the run.
             force: Replace the folder if it holds an earlier run and nothing that the run did not
@@ -72,7 +73,7 @@ class RunDirectory:
                 "--force and --resume exclude each other: one replaces the run, one continues it"
             )
         root = Path(path)
-        record = {"config": to_plain(config), "seeds": to_plain(list(seeds))}
+        record = {"config": finite_or_null(to_plain(config)), "seeds": to_plain(list(seeds))}
         if _is_occupied(root):
             if resume:
                 _check_same_run(root, record)
@@ -147,8 +148,13 @@ class RunDirectory:
         return path
 
     def read_json(self, name: str) -> Any:
-        """Return the content of a JSON file of the run."""
-        return json.loads((self.root / name).read_text(encoding="utf-8"))
+        """Return the content of a JSON file of the run.
+
+        Raises:
+            UserError: It is damaged.
+        """
+        path = self.root / name
+        return _parsed(path.read_text(encoding="utf-8"), path)
 
     def write_json(self, name: str, value: Any) -> Path:
         """Write a JSON file whole or not at all.
@@ -178,14 +184,18 @@ class RunDirectory:
             file.write(line + "\n")
 
     def metrics(self) -> Iterator[dict[str, Any]]:
-        """Yield the logged lines in order; a last line that was cut short is left out."""
+        """Yield the logged lines in order; a last line that was cut short is left out.
+
+        Raises:
+            UserError: Another line is damaged.
+        """
         path = self.root / METRICS
         if not path.exists():
             return
         with path.open(encoding="utf-8") as file:
             for line in file:
                 if line.endswith("\n"):
-                    yield json.loads(line)
+                    yield _parsed(line, path)
 
     def rewind(self, step: int, stage: str | None = None) -> None:
         """Drop the metrics logged after `step`, so that a resumed run repeats none of them.
@@ -209,6 +219,13 @@ def is_run(path: Path) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(content, dict) and content.get("format") == FORMAT
+
+
+def _parsed(text: str, path: Path) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise UserError(f"{path} is damaged ({error}); start anew with --force") from error
 
 
 def to_plain(value: Any) -> Any:

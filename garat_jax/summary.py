@@ -28,6 +28,7 @@ def summarise(
     errors: Mapping[str, np.ndarray],
     curve: Sequence[Mapping[str, Any]],
     target_transitions: int,
+    num_episodes: int,
     env_steps: Mapping[str, np.ndarray],
     seconds: Mapping[str, float],
 ) -> dict[str, Any]:
@@ -44,12 +45,14 @@ def summarise(
         errors: Held-out transition errors [seeds] of `source`, `grounded` and the baselines.
         curve: The logged lines of the grounding.
         target_transitions: How many target transitions the method saw.
+        num_episodes: Episodes that each mean return is of.
         env_steps: Environment steps by stage, [seeds].
         seconds: Wall time spent compiling and running.
     """
     source, target = returns["source_policy"], returns["target_policy"]
-    solved = TARGET_FRACTION * solved_return
-    meaningful = source_solved & (source < SOURCE_FRACTION * target) & (target >= solved)
+    solved = solved_return - (1.0 - TARGET_FRACTION) * abs(solved_return)
+    is_lost = target - source > (1.0 - SOURCE_FRACTION) * np.abs(target)  # returns may be costs
+    meaningful = source_solved & is_lost & (target >= solved)
     scaled = {
         name: scale(returns[name], source, target, meaningful) for name in ("method", *CONTROLS)
     }
@@ -74,6 +77,7 @@ def summarise(
             "grounded": [line["error"] for line in curve],
         },
         "target_transitions": target_transitions,
+        "num_episodes": num_episodes,
         "env_steps": env_steps,
         "seconds": seconds,
     }
@@ -251,7 +255,8 @@ def _returns_caption(summary: Mapping[str, Any]) -> str:
         if left_out
         else ""
     )
-    return f"Mean over seeds (bars) and every seed (dots), 50 episodes each.{note}"
+    episodes = summary["num_episodes"]
+    return f"Mean over seeds (bars) and every seed (dots), {episodes} episodes each.{note}"
 
 
 def _returns_table(summary: Mapping[str, Any]) -> Table:

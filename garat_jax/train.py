@@ -13,7 +13,7 @@ from rich.console import Console
 
 from garat_jax import checkpoint, split
 from garat_jax.devices import peak_mebibytes
-from garat_jax.errors import DivergedError
+from garat_jax.errors import DivergedError, UserError
 from garat_jax.interrupt import deferred_interrupt
 from garat_jax.rollout import Fault
 from garat_jax.runs import RunDirectory
@@ -97,13 +97,19 @@ class Trainer:
 
         Raises:
             DivergedError: A state stopped being finite.
+            UserError: The stage is over, and its checkpoint is gone or damaged.
         """
         folder = self.run.path(f"checkpoints/{stage}")
-        first = 0
+        first, over = 0, self.run.root / _done(stage)
         if self.run.resumed and (latest := checkpoint.latest_step(folder)) is not None:
             state, first = checkpoint.restore(folder, state), latest
             self.console.print(f"{stage}: restored after iteration {first}")
-        if (self.run.root / _done(stage)).exists():
+        if over.exists():
+            if not first:
+                raise UserError(
+                    f"{stage} is over, but its checkpoint in {folder} is gone; start anew with "
+                    "--force"
+                )
             return state
         if self.run.resumed:
             self.run.rewind(first, stage)

@@ -350,6 +350,7 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
         errors=errors,
         curve=[line for line in run.metrics() if line["stage"] == "grounding"],
         target_transitions=recorded.transitions.reward[0].size,
+        num_episodes=config.num_episodes,
         env_steps={
             name: np.asarray(state.env_steps)
             for name, state in (states | {"grounding": grounding.transformer}).items()

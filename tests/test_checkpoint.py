@@ -1,4 +1,5 @@
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 from flax import struct
 
 from garat_jax.checkpoint import latest_step, restore, save
+from garat_jax.errors import UserError
 
 
 class Network(NamedTuple):
@@ -110,6 +112,19 @@ def test_another_structure_is_refused(tmp_path, other):
     save(tmp_path, 0, {"x": jnp.zeros(2)})
     with pytest.raises(ValueError, match="does not fit"):
         restore(tmp_path, other)
+
+
+@pytest.mark.parametrize("name", ["_METADATA", "manifest.ocdbt", "d", "default"])
+def test_a_damaged_checkpoint_is_told_in_one_line(tmp_path, name):
+    save(tmp_path, 0, {"x": jnp.arange(2000.0)})
+    (found,) = (path for path in tmp_path.rglob(name) if path.parent.name in ("default", "0"))
+    if found.is_dir():
+        shutil.rmtree(found)
+    else:
+        found.write_bytes(found.read_bytes()[:10])
+    with pytest.raises(UserError, match=r"the checkpoint in .* is damaged") as caught:
+        restore(tmp_path, {"x": jnp.zeros(2000)})
+    assert "\n" not in str(caught.value)
 
 
 def test_paths_that_collide_are_refused(tmp_path):

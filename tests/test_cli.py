@@ -75,6 +75,7 @@ def test_version():
         (["transfer", "x", "--seeds", "0"], ["--seeds 0", "1 or more"]),
         (["transfer", "x", "--engine", "mjxx"], ["'mjxx'", "'auto', 'mjx', 'mujoco'"]),
         (["transfer", "x", "--distributed", "--resume"], ["--distributed", "leave out --resume"]),
+        (["transfer", "x", "--process-id", "1"], ["--process-id", "with --distributed"]),
         (["transfer", "x", "--device", "abacus"], ["'abacus'", "'auto', 'cpu', 'gpu', 'tpu'"]),
         (["compare", "no.xml", "no.csv"], ["MODEL", "there is no file no.xml"]),
         (["compare", __file__], ["DATA", "one file or more"]),

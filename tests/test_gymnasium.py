@@ -224,6 +224,15 @@ def test_mistakes_are_named():
         vector.reset(seed=[1, 2, 3])
     with pytest.raises(ValueError, match="no options, not reset_mask"):
         vector.reset(options={"reset_mask": np.ones(2, bool)})
+    with pytest.raises(ValueError, match="num_envs is 0"):
+        to_gymnasium_vector(Walk(), WalkParams(0.1), 0)
+    env.reset(seed=0)
+    vector.reset(seed=0)
+    for action in (0.5, np.zeros(2), np.zeros((1, 1))):
+        with pytest.raises(ValueError, match=r"actions of shape .*; expected \(1,\)"):
+            env.step(action)
+    with pytest.raises(ValueError, match=r"actions of shape \(1, 1\); expected \(2, 1\)"):
+        vector.step(np.zeros((1, 1)))
 
 
 def test_without_gymnasium_the_extra_is_named(monkeypatch):

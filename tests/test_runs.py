@@ -173,6 +173,23 @@ def test_every_setting_is_written_down_and_held_against_a_resumed_run(tmp_path):
         resumed.record_settings({"inner": Inner(0.2), "engine": "mujoco"})
 
 
+def test_a_setting_without_end_is_written_down_as_null(tmp_path):
+    run = create(tmp_path, {"limit": float("inf")})
+    assert run.read_json("config.json")["config"] == {"limit": None}
+    assert create(tmp_path, {"limit": float("inf")}, resume=True).resumed
+
+
+def test_a_damaged_file_of_a_run_is_named(tmp_path):
+    run = create(tmp_path)
+    run.log(1, loss=1.0)
+    for name in ("seconds.json", "metrics.jsonl"):
+        (run.root / name).write_text("{\n")
+    with pytest.raises(UserError, match=r"seconds\.json is damaged"):
+        run.read_json("seconds.json")
+    with pytest.raises(UserError, match=r"metrics\.jsonl is damaged"):
+        list(run.metrics())
+
+
 def test_a_resumed_run_knows_which_versions_changed(tmp_path):
     run = create(tmp_path)
     assert run.changed_versions() == []

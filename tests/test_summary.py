@@ -42,6 +42,7 @@ def summarise(source=(100.0, 100.0, 100.0), target=(1000.0, 1000.0, 1000.0), cou
         "errors": errors,
         "curve": curve,
         "target_transitions": 5000,
+        "num_episodes": 50,
         "env_steps": {"source_policy": np.full(count, 10)},
         "seconds": {"compile": 1.0, "run": 2.0},
     }
@@ -93,6 +94,16 @@ def test_a_seed_that_is_not_meaningful_is_left_out(source, target):
     assert result["controls"]["action_noise"]["scaled"]["per_seed"][1] is None
 
 
+@pytest.mark.parametrize(
+    ("source", "target", "is_meaningful"),
+    [(-40.0, -7.9, True), (-40.0, -9.0, False), (-8.1, -7.0, False), (-6.0, -7.0, False)],
+)
+def test_returns_may_be_costs(source, target, is_meaningful):
+    """What solves the target loses at most 5 % of -8, and the source policy loses much more."""
+    result = summarise((source,), (target,), count=1, solved_return=-8.0)
+    assert result["meaningful"] == [is_meaningful]
+
+
 def test_one_meaningful_seed_has_no_standard_error():
     result = summarise(count=1)
     assert (result["scaled"]["mean"], result["scaled"]["standard_error"]) == (1.0, None)
@@ -109,8 +120,9 @@ def written(run: RunDirectory, result) -> str:
 
 
 def test_the_report_tells_the_result_and_names_the_seeds_left_out(run):
-    text = written(run, summarise((100.0, 400.0, 100.0)))
+    text = written(run, summarise((100.0, 400.0, 100.0), num_episodes=7))
     assert "a heavier thing" in text
+    assert "every seed (dots), 7 episodes each" in text
     assert "0.50 ± 0.50" in text
     assert "Seeds 1 are not meaningful" in text
 

@@ -29,6 +29,14 @@ def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     return observations, gymnasium.spaces.Box(low, high, dtype=np.float32)
 
 
+def _as_actions(actions: Any, space: gymnasium.spaces.Space) -> np.ndarray:
+    """Return actions as an array of a space's shape; bounds are the environment's to keep."""
+    array = np.asarray(actions, np.float32)
+    if array.shape != space.shape:
+        raise ValueError(f"actions of shape {array.shape}; expected {space.shape}")
+    return array
+
+
 def _first_key(random: np.random.Generator) -> jax.Array:
     return jax.random.key(int(random.integers(2**31)))
 
@@ -80,10 +88,11 @@ class GymnasiumEnv(gymnasium.Env):
 
         Raises:
             ResetNeeded: The environment has not been reset yet.
+            ValueError: The action has another shape than the space.
         """
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
-        action = np.asarray(action, np.float32)
+        action = _as_actions(action, self.action_space)
         (result, faulty, _), self._key = self._step(self._params, self._state, action, self._key)
         self._state = result.state
         obs = np.array(result.state.obs, np.float32)
@@ -100,6 +109,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """
 
     def __init__(self, env: Env, params: Params, num_envs: int, same_step: bool = True):
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}; expected 1 or more")
         mode = AutoresetMode.SAME_STEP if same_step else AutoresetMode.NEXT_STEP
         self.num_envs = num_envs
         self.metadata = {"render_modes": [], "autoreset_mode": mode}
@@ -146,10 +157,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             ResetNeeded: The environments have not been reset yet.
+            ValueError: The actions have another shape than the space.
         """
         if self._states is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
-        actions = np.asarray(actions, np.float32)
+        actions = _as_actions(actions, self.action_space)
         (result, faulty, _), self._states, self._keys = self._step(
             self._params, self._states, actions, self._keys, self._over
         )

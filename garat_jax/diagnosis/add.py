@@ -25,6 +25,7 @@ from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.diagnosis.units import after_number
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect, unit_at
+from garat_jax.effects.bounds import check_bounds
 from garat_jax.errors import UserError, choose
 
 
@@ -140,13 +141,7 @@ def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, flo
     host = native_model(model.compile(engine="mujoco"))
     effect.check(host)
     effect = effect.replace(**{**cls.at(host, target), **values})
-    for p in cls.parameters():
-        if p.name in values and not p.low <= values[p.name] <= p.high:
-            unit = unit_at(p, host, target)
-            raise UserError(
-                f"{kind} {p.name} = {values[p.name]:g} is outside its bounds, {p.low:g} to "
-                f"{p.high:g} {unit} ({p.source})"
-            )
+    check_bounds(effect, host)
     if (kind, target) in [(e.kind, e.target) for e in model.effects]:
         raise UserError(f"{model.path} has {kind} at {target} already; change it there")
     return effect
