@@ -25,6 +25,8 @@ from garat_jax.overrides import load_spec
 FORMAT = "garat-model/1"
 CARD_KEYS = ("format", "mjcf", "override", "effect")
 OVERRIDE_KEYS = ("element", "name", "field", "value")
+SAME_INTERVAL = 0.1
+"""Part of a control step by which another may differ for an action transformer to act in it."""
 EFFECT_KEYS = ("kind", "target", "parameters")
 
 
@@ -43,6 +45,7 @@ class Model:
         transform: A learned action transformer, (qpos and qvel as the sensors report them
             [nq + nv], command [nu]) -> command sent instead. Predictions and `world` have it,
             `compile` does not.
+        interval: Seconds of the control steps that it was learned on; None without it.
     """
 
     name: str
@@ -53,6 +56,7 @@ class Model:
     effects: tuple[Effect, ...] = ()
     catalogue: Catalogue = dataclasses.field(default_factory=lambda: CATALOGUE)
     transform: Transform | None = None
+    interval: float | None = None
 
     def compile(self, engine: str = "auto", extra_effects: Sequence[Effect] = ()) -> Dynamics:
         """Compile the model, with more effects after its own; see `dynamics.compile`."""
@@ -61,19 +65,28 @@ class Model:
     def world(self, task: Task, engine: str = "auto") -> World:
         """Return a task in this model, to train in: with its effects, and its action transformer.
 
-        A transformer acts once a control step of the task, which should last as long as those that
-        it was learned on.
+        A transformer acts once a control step of the task, which has to last as long as those that
+        it was learned on, `SAME_INTERVAL` apart at most.
 
         Args:
             task: What to do; its own model may differ in all but joints and actuators.
             engine: As for `dynamics.compile`.
 
         Raises:
-            UserError: The task's own model has other joints or actuators, or as `compile`.
+            UserError: The task's own model has other joints or actuators, its control steps another
+                length than the transformer's, or as `compile`.
         """
         params = self.compile(engine)
         own = compile(load_spec(task.mjcf), engine="mujoco").host.model
         check_same_machine(self.path, params.host.model, task.mjcf, own)
+        lasts = task.num_substeps * params.host.model.opt.timestep
+        learned = self.interval if self.transform else None
+        if learned and abs(lasts - learned) > SAME_INTERVAL * learned:
+            raise UserError(
+                f"{self.path}: its action transformer was learned on control steps of "
+                f"{learned:.4g} s, the task's last {lasts:.4g} s; give garat ground "
+                f"--interval {lasts:.4g}, or the task other num_substeps"
+            )
         return World(TaskEnv(task, params, self.transform), params)
 
 

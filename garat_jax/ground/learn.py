@@ -180,7 +180,9 @@ def ground(
     method, transformer, learned = _learn(lesson, config, reach, trainer)
     chosen = learned["chosen"]["update"] > 0
     transform = with_transformer(method, env, transformer) if chosen else None
-    grounded = dataclasses.replace(model, path=run.root, transform=transform)
+    grounded = dataclasses.replace(
+        model, path=run.root, transform=transform, interval=bounds.interval
+    )
     comparison = compare(model, held_out, say, [grounded])
     summary = {
         "format": FORMAT,

@@ -94,7 +94,8 @@ def load_grounded(
     )
     like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes.transformer.policy)
     transformer = checkpoint.restore(root / TRANSFORMER, like)
-    return dataclasses.replace(model, transform=with_transformer(method, env, transformer))
+    transform = with_transformer(method, env, transformer)
+    return dataclasses.replace(model, transform=transform, interval=bounds.interval)
 
 
 def with_transformer(method, env: RecordedEnv, transformer):

@@ -302,8 +302,13 @@ def test_a_run_is_read_back(grounded):
     assert sent[0] != command[0]
 
 
+def hang(mjcf) -> Hang:
+    """Return a task whose control steps last as long as those of the grounding, 0.016 s."""
+    return dataclasses.replace(Hang(mjcf), num_substeps=8)
+
+
 def test_a_task_in_a_grounded_model_sends_what_the_transformer_makes(recorded, grounded):
-    model, task = load_grounded(grounded, {"gat": SMALL}), Hang(recorded[0])
+    model, task = load_grounded(grounded, {"gat": SMALL}), hang(recorded[0])
     assert model.transform is not None
     world, plain = model.world(task), dataclasses.replace(model, transform=None).world(task)
     state = world.env.reset(world.params, jax.random.key(0))
@@ -316,6 +321,13 @@ def test_a_task_in_a_grounded_model_sends_what_the_transformer_makes(recorded, g
     )
     np.testing.assert_allclose(grounded_step.state.obs, step.state.obs, rtol=1e-6)
     np.testing.assert_allclose(grounded_step.reward, action[0])
+
+
+def test_a_task_with_other_control_steps_is_refused(recorded, grounded):
+    model, task = load_grounded(grounded, {"gat": SMALL}), hang(recorded[0])
+    slower = dataclasses.replace(task, num_substeps=5 * task.num_substeps)
+    with pytest.raises(UserError, match=r"learned on control steps of .* the task's last"):
+        model.world(slower)
 
 
 def test_a_task_for_another_machine_is_refused(grounded, tmp_path):
