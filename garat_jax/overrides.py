@@ -36,9 +36,10 @@ class Override:
         """
         target = self._find(spec)
         if self.element == "body" and self.field == "mass":
-            _scale_mass(spec, target, float(self.value))
+            _scale_mass(spec, target, self._number())
             return
-        known = [name for name in dir(target) if not name.startswith("_")]
+        fields = [name for name in dir(target) if not name.startswith("_")]
+        known = [name for name in fields if not callable(getattr(target, name))]
         if self.field not in known:
             raise unknown_name(f"{self.element} field", self.field, known)
         try:
@@ -47,6 +48,12 @@ class Override:
                 current[0] = self.value
             else:
                 setattr(target, self.field, self.value)
+        except (TypeError, ValueError) as error:
+            raise UserError(f"{self.element}/{self.name} {self.field}: {error}") from error
+
+    def _number(self) -> float:
+        try:
+            return float(self.value)
         except (TypeError, ValueError) as error:
             raise UserError(f"{self.element}/{self.name} {self.field}: {error}") from error
 

@@ -250,6 +250,8 @@ def test_a_mass_override_scales_the_inertia_with_it():
         (Override("body", "pool", "mass", 1.0), "did you mean pole"),
         (Override("joint", "hinge", "dampling", 1.0), "did you mean damping"),
         (Override("body", "pole", "mass", -1.0), "must be positive"),
+        (Override("body", "pole", "mass", "heavy"), "body/pole mass: could not convert"),
+        (Override("body", "pole", "add_body", 1.0), "unknown body field 'add_body'"),
         (Override("bodi", "pole", "mass", 1.0), "did you mean body"),
     ],
 )

@@ -149,12 +149,19 @@ def observe(env: Env, state: ActorCriticState, transitions: Transition) -> Actor
     return state._replace(policy=state.policy._replace(normaliser=updated))
 
 
-def episode_metrics(state: ActorCriticState, transitions: Transition) -> dict[str, jax.Array]:
-    """Return a batch's mean reward a step, mean steps an episode and share of faulty steps."""
+def episode_metrics(
+    env: Env, state: ActorCriticState, transitions: Transition
+) -> dict[str, jax.Array]:
+    """Return a batch's mean reward a step, mean steps an episode and share of faulty steps.
+
+    Episodes that go on count as far as they went: their mean is the batch's steps for each that
+    ended, as many as truncate one at most.
+    """
     ended = jnp.sum(transitions.terminated | transitions.truncated)
+    length = transitions.reward.size / jnp.maximum(ended, 1)
     return {
         "reward": transitions.reward.mean(),
-        "episode_length": transitions.reward.size / jnp.maximum(ended, 1),
+        "episode_length": jnp.minimum(length, env.episode_length),
         "faulty_share": state.fault.num_steps / transitions.reward.size,
     }
 

@@ -86,7 +86,8 @@ def make(env: Env, config: PPOConfig) -> Agent:
             optimiser=optimiser_state,
             key=key,
         )
-        metrics = jax.tree.map(jnp.mean, metrics) | actor_critic.episode_metrics(state, transitions)
+        metrics = jax.tree.map(jnp.mean, metrics)
+        metrics = metrics | actor_critic.episode_metrics(env, state, transitions)
         return actor_critic.observe(env, state, transitions), metrics, transitions
 
     return Agent(init, step, policy, mean, config.num_envs * config.num_steps)

@@ -71,7 +71,7 @@ def make(env: Env, config: TRPOConfig) -> Agent:
             optimiser=optimiser_state,
             key=key,
         )
-        metrics = metrics | actor_critic.episode_metrics(state, transitions)
+        metrics = metrics | actor_critic.episode_metrics(env, state, transitions)
         metrics["value_loss"] = value_loss
         return actor_critic.observe(env, state, transitions), metrics, transitions
 

@@ -1,5 +1,6 @@
 """The errors on held-out recordings that are reported."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import mujoco
@@ -100,6 +101,28 @@ def longest_errors(
     floor = noise_floor(longer, make_metric(longer), after)
     errors = errors_of(longer, (before, after), floor, host, how, signals_mostly_above)
     return None if errors.is_too_coarse else errors
+
+
+def warn_of_fitted(problem: Problem, fitted: Fit, host: mujoco.MjModel) -> tuple[str, ...]:
+    """Say that the recordings that are fitted show a gap, if they do.
+
+    Of use where those held out show none: they may lack the motion, or the signal, that would.
+
+    Args:
+        problem: The recordings, cut.
+        fitted: The model, initial states settled.
+        host: The compiled model.
+    """
+    other = dataclasses.replace(problem, fitted=~problem.fitted)
+    metric = make_metric(other)
+    loud = signals_above(other, metric, fitted, noise_floor(other, metric, fitted))
+    if not loud.any():
+        return ()
+    names = " and ".join(signals(host)[i].name for i in np.flatnonzero(loud))
+    return (
+        f"the recordings held out agree with the model, but it does not predict {names} of the "
+        "others as well as noise allows; hold out others (--holdout)",
+    )
 
 
 def are_explained(error: Errors, longest: Errors | None) -> bool:

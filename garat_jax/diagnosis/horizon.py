@@ -88,8 +88,11 @@ def warn_of_divergence(
         f"timestep of {grid.timestep:g} s"
     )
     if early > 1.0 - MOST:
+        odd = "look first at the warnings of the recordings, or " * any(
+            recording.warnings for recording in recordings
+        )
         raise UserError(
-            f"{when}, so that no recording can be followed; give it a smaller timestep, an "
+            f"{when}, so that no recording can be followed; {odd}give it a smaller timestep, an "
             "implicit integrator or softer gains"
         )
     cut_to = f"; segments were shortened to {horizon:g} s" if horizon < longest else ""

@@ -119,14 +119,20 @@ def localise(missing: MissingTorque) -> list[Place]:
                 evidence = (
                     f"{100 * share:.0f} % of the missing torque is at {name}, {regime}: "
                     f"{shown}{' ' * bool(unit)}{unit}"
-                    + words.format(sign="with" if size > 0 else "against")
+                    + words.format(
+                        sign="with" if size > 0 else "against",
+                        torque=at_slide("N m") if slides else "N m",
+                    )
                 )
                 places.append(Place(name, share, regime, evidence))
     return sorted(places, key=lambda place: -place.share)
 
 
 def _features(m: MissingTorque, dof: int):
-    """Yield (regime, feature [M], unit of its size at a hinge, words with {sign}) for one dof."""
+    """Yield (regime, feature [M], unit of its size at a hinge, words) for one dof.
+
+    In the words stand {sign} for that of the size and {torque} for the unit of a torque there.
+    """
     speed, position = m.velocity[:, dof], m.position[:, dof]
     command, load, contact = m.command[:, dof], m.load[:, dof], m.contact[:, dof]
     scale = float(np.sqrt(np.mean(speed**2))) + 1e-12
@@ -142,7 +148,8 @@ def _features(m: MissingTorque, dof: int):
     yield "in proportion to the command", command, "", " of the commanded torque"
     much = MUCH * float(np.abs(command).max(initial=0.0))
     beyond = np.sign(command) * np.maximum(np.abs(command) - much, 0.0)
-    yield "when much is commanded", beyond, "", f" of the commanded torque beyond {much:.3g}"
+    words = f" of the commanded torque beyond {much:.3g}" + " {torque}"
+    yield "when much is commanded", beyond, "", words
     yield "when the command changes", np.gradient(command), "", " of its change in a sample"
     yield "in proportion to the load", load, "", " of the model's own load torque"
     yield "in proportion to the contacts", contact, "", " of the model's own contact torque"

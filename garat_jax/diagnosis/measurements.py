@@ -7,7 +7,7 @@ ball and free joints add `.0 .1 ...`. SI units.
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -136,9 +136,10 @@ def _check_columns(table: Table, model: mujoco.MjModel) -> bool:
                 f"{table.path}: {unknown} (--map renames columns and leaves others out)"
             )
     measured = any(name in table.columns for name in velocities)
-    for name in ["time", *positions, *commands, *(velocities if measured else [])]:
+    wanted = ["time", *positions, *commands, *(velocities if measured else [])]
+    for name in wanted:
         if name not in table.columns:
-            raise _missing(table, name)
+            raise _missing(table, name, wanted)
     return measured
 
 
@@ -154,14 +155,15 @@ def _check_actuators(table: Table, commands: list[str]) -> None:
     )
 
 
-def _missing(table: Table, name: str) -> UserError:
+def _missing(table: Table, name: str, wanted: Collection[str]) -> UserError:
+    """Describe a column that lacks; of those `wanted`, none is another's misspelt name."""
     reason = {
         "time": "the time of each sample in seconds",
         "qpos": "the position of every joint is needed",
         "ctrl": "the command of every actuator is needed; write 0 where it was off",
         "qvel": "give the velocity of every joint, or of none and it is estimated",
     }[name.partition(".")[0]]
-    close = nearest(name, table.columns)
+    close = nearest(name, [column for column in table.columns if column not in wanted])
     there = f"nearest is {close[0]}" if close else f"there are {', '.join(table.columns)}"
     return UserError(f"{table.path}: missing column {name!r} ({reason}); {there}")
 

@@ -161,7 +161,7 @@ def plan(
     if not np.isfinite(best[0]):
         raise UserError(
             f"no excitation was found under which both {first} and {second} show "
-            "and all joints stay within their ranges"
+            f"and all joints stay within their ranges{judge.why}"
         )
     names = tuple(element_names(host, "actuator"))
     return Planned(time, best[1], best[2], min(before, 1.0), best[0], places, names)
@@ -226,6 +226,21 @@ class _Judge:
         self._grid = choose_grid([still], host.opt.timestep)
         self._simulator = Simulator(model, effects, self._grid)
         self._sizes = [type(e).starts(host, e.target)[0] for e in effects]
+        self._places, self._hidden, self._outside = places, set(), set()
+
+    @property
+    def why(self) -> str:
+        """What kept excitations from being of use, as a clause; empty if nothing did."""
+        reasons = []
+        if self._outside:
+            left = "leaves its range" if len(self._outside) == 1 else "leave theirs"
+            reasons.append(
+                f"{', '.join(sorted(self._outside))} {left} even under small commands "
+                "(does it fall, or is ctrlrange in another unit than the actuator takes?)"
+            )
+        if self._hidden:
+            reasons.append(f"{' and '.join(sorted(map(str, self._hidden)))} did not show")
+        return f": {', and '.join(reasons)}" if reasons else ""
 
     def _recording(self, path: np.ndarray, ctrl: np.ndarray) -> Recording:
         qpos, qvel = np.split(path, [self._host.nq], axis=1)
@@ -237,11 +252,14 @@ class _Judge:
         It is infinite if one effect does not show, or a joint leaves its range however small the
         commands are.
         """
+        beyond: set[str] = set()
         for part in 0.5 ** np.arange(HALVINGS):
             ctrl = _scaled(shape, self._limits, part * amplitude, part * bias)
             path = self._path(ctrl)
-            if self._is_within(path):
+            beyond = self._beyond(path)
+            if not beyond:
                 return self._cosine(path, ctrl), ctrl
+        self._outside |= beyond
         return np.inf, _scaled(shape, self._limits, 0.0, 0.0)
 
     def _path(self, ctrl: np.ndarray) -> np.ndarray:
@@ -251,16 +269,18 @@ class _Judge:
         base, start = self._simulator.base[None], self._resting[:1]
         return self._simulator.predict(base, start[None], whole)[0, 0]
 
-    def _is_within(self, path: np.ndarray) -> bool:
-        """Say whether the motion stays finite and every joint in its range, as far as at rest."""
-        host = self._host
+    def _beyond(self, path: np.ndarray) -> set[str]:
+        """Name the joints that leave their range by more than at rest; all if a motion diverges."""
+        host, names = self._host, np.asarray(element_names(self._host, "joint"))
+        if not np.isfinite(path).all():
+            return {*names.tolist()}
         single = np.asarray([DOFS_OF_JOINT[int(kind)] == 1 for kind in host.jnt_type], bool)
         joints = np.flatnonzero(single & (host.jnt_limited != 0))
         low, high = host.jnt_range[joints].T
         position = path[:, host.jnt_qposadr[joints]]
         beyond = np.maximum(low - position, position - high) / (high - low)
         allowed = BEYOND + np.maximum(beyond[0], 0.0)
-        return bool(np.isfinite(path).all() and np.all(beyond <= allowed))
+        return {*names[joints[np.any(beyond > allowed, axis=0)]].tolist()}
 
     def _cosine(self, path: np.ndarray, ctrl: np.ndarray) -> float:
         """Return the cosine of the two effects, infinite if one does not show."""
@@ -273,6 +293,7 @@ class _Judge:
         first, second = StartSpace(lin.start).remove(changes).reshape(-1, 2).T
         sizes = np.linalg.norm(first), np.linalg.norm(second)
         if min(sizes) <= VISIBLE * max(sizes):
+            self._hidden.add(self._places[int(np.argmin(sizes))])
             return np.inf
         return float(abs(first @ second) / (sizes[0] * sizes[1]))
 

@@ -354,8 +354,9 @@ def _ranking(diagnosis: Diagnosis) -> list[Section]:
                     rows,
                     "Share: of the fitted recordings' squared error that it explains. Error: on "
                     "held-out recordings once it is fitted; effects without one were ruled out "
-                    "before. Stable: how often it, or one that looks like it, comes out first when "
-                    "the recordings are resampled.",
+                    "before. Of what was added, both are those of the round in which it was, and "
+                    "the size is that of the final fit. Stable: how often it, or one that looks "
+                    "like it, comes out first when the recordings are resampled.",
                 )
             ],
         )

@@ -300,9 +300,11 @@ class Diagnosis:
             lines += [f"  where: {place.evidence}" for place in self.where[:3]]
         if self.unseen:
             lines.append(f"  not shown by these recordings: {list_unseen(self.unseen)}")
+        final = {c.named for c in self.selected} if len(self.selected) > 1 else set()
         for c in self.candidates[:6]:
             fitted = f", held-out error {c.error_after:.3g}, stability {c.stability:.2f}"
             share = f"share {c.share:.2f}{fitted if math.isfinite(c.error_after) else ' expected'}"
+            share = f"when it was added {share}" if c.named in final else share
             said = "; ".join(part for part in (c.sizes, share, c.why) if part)
             lines.append(f"  {'*' if c.passes else ' '} {c.named}: {said}")
         for rung in self.ladder:

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from garat_jax.agents import actor_critic
+from garat_jax.agents import actor_critic, ppo
 from garat_jax.agents.actor_critic import Batch
 from garat_jax.agents.ppo import PPOConfig, ppo_loss
+from tests.probe_envs import Walk, WalkParams
 
 CONFIG = PPOConfig(clip=0.2, value_weight=0.5, entropy_weight=0.0)
 ACTION = 0.7
@@ -78,3 +79,15 @@ def test_minibatches_hold_every_row_once_and_whole():
     assert (order != rows).any()
     np.testing.assert_array_equal(cut.action.ravel(), 2 * order)
     np.testing.assert_array_equal(cut.value_target.ravel(), 5 * order)
+
+
+def test_no_episode_is_said_to_be_longer_than_it_may_be():
+    """The first batch, of 4 environments and 5 steps, ends before any episode of 6 steps does."""
+    env, params = Walk(), WalkParams(0.0)
+    config = PPOConfig(num_envs=4, num_steps=5, num_minibatches=1)
+    agent = ppo.make(env, config)
+    state = agent.init(jax.random.key(0), params)
+    state, metrics, _ = agent.step(state, params)
+    assert metrics["episode_length"] == env.episode_length
+    _, metrics, _ = agent.step(state, params)  # each ends one
+    assert metrics["episode_length"] == 5

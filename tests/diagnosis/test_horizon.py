@@ -154,6 +154,19 @@ def test_what_recordings_held_out_show_in_longer_segments_alone_is_found():
     assert gain.parameters["scale"].estimate == pytest.approx(0.3, rel=0.03)
 
 
+def test_a_gap_that_recordings_held_out_never_show_is_a_warning():
+    model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
+    *recordings, last = (record(weaken, seed) for seed in range(4))
+    still = dataclasses.replace(last, qpos=0 * last.qpos, qvel=0 * last.qvel, ctrl=0 * last.ctrl)
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(len(last.time), 2)) * [1e-3, 1e-2]
+    still = dataclasses.replace(still, qpos=noise[:, :1], qvel=noise[:, 1:])
+    found = diagnose(model, recordings, [still])
+    assert found.verdict == "adequate"
+    assert "it does not predict qpos.hinge and qvel.hinge of the others" in " ".join(found.warnings)
+    assert not diagnose(model, [still, still], [still]).warnings
+
+
 SERVO = """
 <mujoco>
   <option timestep="0.002" integrator="implicitfast"/>

@@ -16,7 +16,7 @@ PARTS = {
     "in proportion to the contacts": (CONTACT, "of the model's own contact torque"),
     "when much is commanded": (
         np.sign(COMMAND) * np.maximum(np.abs(COMMAND) - MUCH * np.abs(COMMAND).max(), 0.0),
-        f"of the commanded torque beyond {MUCH * np.abs(COMMAND).max():.3g}",
+        f"of the commanded torque beyond {MUCH * np.abs(COMMAND).max():.3g} N m",
     ),
     "drifting with time": (
         TIME / 10.0 - 0.5,

@@ -107,7 +107,7 @@ def test_unknown_column_names_the_nearest(tmp_path):
     ("name", "said"),
     [
         ("time", "the time of each sample in seconds"),
-        ("qpos.hinge", "the position of every joint is needed); nearest is"),
+        ("qpos.hinge", "the position of every joint is needed); there are time, "),
         ("ctrl.motor", "the command of every actuator is needed; write 0"),
     ],
 )

@@ -8,6 +8,7 @@ import pytest
 from garat_jax import cli
 from garat_jax.diagnosis import load_model
 from garat_jax.diagnosis.plan import Place, plan
+from garat_jax.errors import UserError
 from tests import models
 
 
@@ -109,3 +110,24 @@ def test_a_model_without_actuators_is_refused(tmp_path, capsys):
     separate = ["--separate", "viscous_damping", "coulomb_friction"]
     assert cli.main(["plan", str(path), *separate, "--out", str(tmp_path / "x.csv")]) == 2
     assert "has no actuators, so nothing can be commanded" in capsys.readouterr().err
+
+
+FALLING = """
+<mujoco>
+  <worldbody>
+    <body>
+      <joint name="lift" type="slide" axis="0 0 1" limited="true" range="-0.1 0.1" armature="1"/>
+      <geom type="sphere" size="0.05" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="hoist" joint="lift" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+def test_what_keeps_a_plan_from_being_made_is_said(tmp_path):
+    """Nothing holds the lift: its stop, which is soft, is all that it shows."""
+    (tmp_path / "lift.xml").write_text(FALLING)
+    model = load_model(tmp_path / "lift.xml")
+    with pytest.raises(UserError, match=r"ranges: lift leaves its range even under small commands"):
+        plan(model, "coulomb_friction", "viscous_damping", seconds=4.0)
