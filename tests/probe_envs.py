@@ -110,6 +110,8 @@ PROBES: dict[str, Probe] = {
 class AnyProbe(Probe):
     """All of them; `params` is the index of the one to be, so that one program serves all."""
 
+    episode_length = max(probe.episode_length for probe in PROBES.values())
+
     def reset(self, params, key):
         return jax.lax.switch(params, [partial(p.reset, None) for p in PROBES.values()], key)
 
