@@ -100,12 +100,12 @@ class Trainer:
             UserError: The stage is over, and its checkpoint is gone or damaged.
         """
         folder = self.run.path(f"checkpoints/{stage}")
-        first, over = 0, self.run.root / _done(stage)
+        first, is_restored = 0, False
         if self.run.resumed and (latest := checkpoint.latest_step(folder)) is not None:
-            state, first = checkpoint.restore(folder, state), latest
+            state, first, is_restored = checkpoint.restore(folder, state), latest, True
             self.console.print(f"{stage}: restored after iteration {first}")
-        if over.exists():
-            if not first:
+        if (self.run.root / _done(stage)).exists():
+            if not is_restored:
                 raise UserError(
                     f"{stage} is over, but its checkpoint in {folder} is gone; start anew with "
                     "--force"

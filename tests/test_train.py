@@ -102,6 +102,13 @@ def test_a_stage_that_is_over_is_not_run_again(tmp_path):
     assert len(lines(again)) == 3
 
 
+def test_a_stage_without_iterations_is_over_at_its_start(tmp_path):
+    step, start = learner()
+    for resume in (False, True):
+        run = directory(tmp_path / "run", resume=resume)
+        assert_same_state(trainer(run).train("walk", step, start, 0.1, 0), start)
+
+
 def test_a_stage_that_is_over_and_has_lost_its_checkpoint_is_not_taken_for_its_start(tmp_path):
     step, start = learner()
     run = directory(tmp_path / "run")
