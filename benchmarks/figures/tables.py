@@ -116,6 +116,18 @@ def optimisation_level() -> str:
     return table(columns, rows) + origin("optimisation_level", result)
 
 
+def profiling_clock() -> str:
+    result = read("profiling_clock")
+    ways = tuple(result["rows"][0]["steps_per_second"])
+    rows = []
+    for row in result["rows"]:
+        rates = [row["steps_per_second"][way] for way in ways]
+        gains = (f"{rate:,.0f} (× {rate / rates[0]:.2f})" for rate in rates[1:])
+        rows.append((row["pair"].replace("_", " "), f"{rates[0]:,.0f}", *gains))
+    columns = ("source of", "as MuJoCo's package is", "without the clock", "without islands, too")
+    return table(columns, rows) + origin("profiling_clock", result)
+
+
 def hidden_effects(seed: int) -> str:
     """One row a measure, beside what it is held to."""
     name = f"hidden_effects_seed_{seed}"
@@ -290,6 +302,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "flags": flags,
     "fidelity": fidelity,
     "optimisation_level": optimisation_level,
+    "profiling_clock": profiling_clock,
     "hidden_effects_seed_4": functools.partial(hidden_effects, 4),
     "hidden_effects_seed_5": functools.partial(hidden_effects, 5),
     "hidden_effects_seed_6": functools.partial(hidden_effects, 6),

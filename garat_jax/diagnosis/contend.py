@@ -76,7 +76,7 @@ def fit_contenders(
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
         if hopeless and not alike and len(contenders) > 1:
             continue
-        contenders.append(_fit(problem, current, score, rival, say))
+        contenders.append(fit_one(problem, current, score, rival, say))
     return contenders + _fit_alike(problem, current, likely, contenders, say)
 
 
@@ -89,7 +89,7 @@ def _fit_alike(problem: Problem, current: Fit, likely, contenders: Sequence[Cont
     others = [s for s in likely if s.effect not in done]
     rival = best.fit.cost[problem.fitted].sum()
     alike = alike_as_fitted(problem, current, best.score, best.fit, others)
-    return [_fit(problem, current, score, rival, say) for score in alike]
+    return [fit_one(problem, current, score, rival, say) for score in alike]
 
 
 def best_of(contenders: Sequence[Contender]) -> Contender | None:
@@ -133,7 +133,7 @@ def fit_refinements(
         return []
     rival = contender.fit.cost[problem.fitted].sum()
     return [
-        _fit(problem, current, refined, rival, say)
+        fit_one(problem, current, refined, rival, say)
         for score in scores
         if refines(problem, score.effect, simple)
         and (refined := as_refined(problem, score, contender.fit.theta, [simple]))
@@ -173,7 +173,7 @@ def _fit_refined(
             theta[own] = simulator.base[own]
             free = tuple(j for j in current.free if j not in own)
             without = dataclasses.replace(current, theta=theta, free=free)
-            found.append(_fit(problem, without, refined, np.inf, say))
+            found.append(fit_one(problem, without, refined, np.inf, say))
     return found
 
 
@@ -286,7 +286,7 @@ def with_twins(
         for score in twins(like, others):
             same = _as_twin(problem, current, contender, like, score)
             rival = contender.fit.cost[problem.fitted].sum()
-            found.append(same or _fit(problem, current, score, rival, say))
+            found.append(same or fit_one(problem, current, score, rival, say))
     return [*contenders, *found]
 
 
@@ -367,8 +367,16 @@ def with_evidence(
     return tested
 
 
-def _fit(problem: Problem, current: Fit, score: Score, rival: float, say) -> Contender:
-    """Fit the selected effects and one more, from where screening puts it."""
+def fit_one(problem: Problem, current: Fit, score: Score, rival: float, say) -> Contender:
+    """Fit the selected effects and one more, from where screening puts it.
+
+    Args:
+        problem: The recordings and the model with every candidate.
+        current: The fit of the effects selected so far.
+        score: What screening says of the one more.
+        rival: As for `fit`.
+        say: Told what is being done.
+    """
     effect = problem.simulator.effects[score.effect]
     say(f"fitting {effect.kind} at {effect.target}")
     theta = current.theta.copy()

@@ -4,6 +4,7 @@ A law is superfluous, too, where another at its place that refines it can do all
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -13,16 +14,24 @@ from garat_jax.diagnosis.contend import (
     Contender,
     as_refined,
     complete,
+    fit_one,
     refines,
     under_another_name,
+    with_evidence,
+    with_twins,
 )
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
-from garat_jax.diagnosis.judge import leads
+from garat_jax.diagnosis.judge import Judged, judge, leads
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, noise_floor
+from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.simulate import columns_of
 from garat_jax.diagnosis.starts import Fit
+
+NEWCOMERS = 2
+"""Candidates fitted in an earlier effect's place, of those that screening puts before it by now."""
 
 
 class Step(NamedTuple):
@@ -94,12 +103,12 @@ def refitted(problem: Problem, steps: list[Step], current: Fit) -> list[Step]:
 
 
 def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit, say):
-    """Hold effects once more against what did much the same, beside all that was found since.
+    """Hold effects once more against others, beside all that was found since.
 
     By itself an effect may lead for what it says of another, which was missing yet; beside that
-    one, recordings may tell apart what they could not, and may no longer what they did. One that
-    fits better by now comes in its place, and what was added since may only have made up for the
-    wrong one.
+    one, recordings may tell apart what they could not, and may no longer what they did. It is held
+    against what did much the same then, and against what would come first now. One that fits better
+    by now comes in its place, and what was added since may only have made up for the wrong one.
 
     Returns:
         The steps, each with those that the recordings do not tell from it now, and the fit with
@@ -116,11 +125,31 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
                     say(f"trying {candidate.named} instead of {step.candidate.named}")
                     trial = _fit_instead(problem, fitted, others, contender)
                 trials.append((candidate, dataclasses.replace(contender, fit=trial)))
+        trials += _newcomers(problem, metric, step, fitted, others, say)
         found[place], fitted = _best_of(problem, metric, step, fitted, trials, say)
     if fitted is current:
         return found, current
     kept, fitted = prune(problem, found, fitted, found, say)
     return (refitted(problem, kept, fitted) if len(kept) == len(found) else kept), fitted
+
+
+def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others, say) -> Judged:
+    """Fit what screening would put before a step now, in its place, if that was not tried yet."""
+    say(f"looking for what would explain more than {step.candidate.named}")
+    without = _fit_only(problem, fitted, others)
+    scores = screen(problem, without, others)
+    tried = {step.effect, *(contender.score.effect for _, contender in step.alike)}
+    known = [score for score in scores if score.effect in tried]
+    ahead = itertools.takewhile(lambda score: score.effect != step.effect, scores)
+    ahead = [s for s in ahead if s.possible and s.effect not in tried and not twins(s, known)]
+    ahead = [s for s in ahead if not refines(problem, s.effect, step.effect)]
+    ahead = [s for i, s in enumerate(ahead) if not twins(s, ahead[:i])][:NEWCOMERS]
+    rival = fitted.cost[problem.fitted].sum()
+    new = [fit_one(problem, without, score, rival, say) for score in ahead]
+    new = with_twins(problem, without, scores, new, say)
+    new = with_evidence(problem, without, new, len(scores))
+    floor = noise_floor(problem, metric, fitted)
+    return [pair for pair in judge(problem, metric, without, scores, new, floor) if pair[1]]
 
 
 def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, say):

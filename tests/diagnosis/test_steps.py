@@ -72,19 +72,20 @@ def contender(problem: Problem, effect: int) -> Contender:
     return Contender(score, fit_with(problem, effect))
 
 
-def reconsidered(problem: Problem, first: int, other: int, *later: int, named: bool = True):
+def reconsidered(problem: Problem, first: int, other: int | None, *later: int, named: bool = True):
     """Add an effect that did much what another does, then more; return what becomes of them.
 
     Args:
         problem: What is fitted.
         first: What was added.
-        other: What did much the same.
+        other: What did much the same, if anything did.
         later: What was added since.
         named: Whether the recordings could not tell the two apart then.
     """
-    alike = [(candidate(other), contender(problem, other))]
+    others = [] if other is None else [other]
+    alike = [(candidate(effect), contender(problem, effect)) for effect in others]
     own = contender(problem, first)
-    steps, added = [Step(candidate(first, *[other][:named]), own, own.fit, alike)], [first]
+    steps, added = [Step(candidate(first, *others[:named]), own, own.fit, alike)], [first]
     for effect in later:
         added.append(effect)
         fitted = fit_with(problem, *added)
@@ -103,6 +104,18 @@ def test_an_effect_gives_way_to_one_that_it_was_like_and_that_fits_better_by_now
     assert current.theta[DAMPING] == pytest.approx(DAMPED, rel=0.05)
     assert current.theta[DRAG] == 0.0
     assert steps[-1].fit is current
+
+
+def test_an_effect_gives_way_to_what_comes_first_only_beside_what_was_found_since(problem):
+    steps, current, _ = reconsidered(problem, DRAG, None, OFFSET)
+    first, alike = steps[0].effect, steps[0].candidate.indistinguishable_from
+    assert steps[1].effect == OFFSET
+    assert {steps[0].candidate.named, *alike} == {
+        Named("viscous_damping", AT), Named("back_emf", MOTOR)
+    }  # fmt: skip
+    assert steps[0].candidate.passes
+    assert current.theta[first] == pytest.approx(DAMPED, rel=0.05)
+    assert current.theta[DRAG] == 0.0
 
 
 def test_what_only_made_up_for_the_wrong_effect_goes_with_it(problem):
@@ -136,7 +149,7 @@ def test_another_name_of_what_was_added_needs_no_fit_of_its_own(problem):
     later = Step(candidate(OFFSET), contender(problem, OFFSET), both, [])
     steps = [Step(candidate(DAMPING), own, own.fit, alike), later]
     found, current = reconsider(problem, make_metric(problem), steps, both, said.append)
-    assert said == []
+    assert said == [f"looking for what would explain more than {Named('viscous_damping', AT)}"]
     assert found[0].candidate.indistinguishable_from == (Named("back_emf", MOTOR),)
     assert current is both
 
