@@ -100,8 +100,11 @@ class Transfer:
         """Run the transfer experiment."""
         if self.seeds < 1:
             raise UserError(f"--seeds {self.seeds}: expected 1 or more")
-        alone = {"--coordinator": self.coordinator, "--num-processes": self.num_processes}
-        alone |= {"--process-id": self.process_id}
+        alone = {
+            "--coordinator": self.coordinator,
+            "--num-processes": self.num_processes,
+            "--process-id": self.process_id,
+        }
         given = [name for name, value in alone.items() if value is not None]
         if given and not self.distributed:
             raise UserError(f"{given[0]} is for runs with --distributed; give that, too")

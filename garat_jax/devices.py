@@ -102,6 +102,8 @@ def describe(error: RuntimeError) -> UserError:
     """Turn JAX's complaint about a device into one for the user."""
     reason = str(error).partition("\n")[0].partition(" (set JAX_PLATFORMS")[0].rstrip(".")
     wanted = str(jax.config.jax_platforms).partition(",")[0]  # pyright: ignore[reportAttributeAccessIssue]
+    if wanted == "gpu" and "known backends" in reason:  # JAX names ROCm, whichever is lacking
+        reason = "no backend for it is installed; pip install 'garat_jax[cuda]' brings NVIDIA's"
     return UserError(
         f"JAX finds no device {wanted!r} ({reason}); "
         "choose another with --device or the variable JAX_PLATFORMS"
