@@ -195,10 +195,9 @@ def missing_torques(
                 row=row,
                 col=1,
             )
-        figure.update_xaxes(title_text=title, row=row, col=1)
-        low, high = np.quantile(y, [0.005, 0.995])
-        margin = 0.15 * (high - low)
-        figure.update_yaxes(range=[low - margin, high + margin], row=row, col=1)
+        across, up = _without_far(x, 0.002, 0.05), _without_far(y, 0.005, 0.15)
+        figure.update_xaxes(title_text=title, range=across, row=row, col=1)
+        figure.update_yaxes(range=up, row=row, col=1)
     figure = styled(figure, height=260 * len(axes))
     return figure.update_yaxes(title_text=f"missing [{force}]", title_font_size=12)
 
@@ -301,6 +300,13 @@ def _abscissa(missing: MissingTorque, field: str, dof: int, unit: str) -> np.nda
     if field == "position" and unit == "rad" and np.ptp(values) > 2 * np.pi:
         return (values + np.pi) % (2 * np.pi) - np.pi
     return values
+
+
+def _without_far(values: np.ndarray, share: float, margin: float) -> list[float]:
+    """Return an axis without this share of the values at either end, with a margin around."""
+    low, high = np.quantile(values, [share, 1 - share])
+    wider = margin * (high - low)
+    return [float(low - wider), float(high + wider)]
 
 
 def _binned(x: np.ndarray, y: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

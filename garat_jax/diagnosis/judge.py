@@ -11,6 +11,7 @@ from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem, block_labels
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
 from garat_jax.diagnosis.starts import Fit
+from garat_jax.effects import Parameter
 from garat_jax.effects.units import unit_at
 
 SMALLEST_SHARE = 0.05
@@ -24,6 +25,8 @@ NEGLIGIBLE = 0.01
 which the effect acts shows next to no change."""
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
+ROUNDING = 1e-9
+"""Distance from a bound, relative to a parameter's `scale`, that is only rounding."""
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
 BEHIND = "another explains more for certain"
 NO_CERTAIN_GAIN = "the held-out error does not fall for certain"
@@ -212,14 +215,20 @@ def estimates(problem: Problem, effect: int, fitted: Fit) -> dict[str, Estimate]
         if slot.effect != effect:
             continue
         unit = unit_at(slot.parameter, simulator.host, simulator.effects[effect].target)
+        value = _at_end(slot.parameter, float(fitted.theta[j]))
         if j in fitted.free and j not in fitted.frozen:
             at = fitted.free.index(j)
             low, high = float(fitted.low[at]), float(fitted.high[at])
-            estimates[slot.parameter.name] = Estimate(float(fitted.theta[j]), low, high, unit)
+            estimates[slot.parameter.name] = Estimate(value, low, high, unit)
         elif fitted.theta[j] != slot.parameter.nominal:
-            value = float(fitted.theta[j])
             estimates[slot.parameter.name] = Estimate(value, float("nan"), float("nan"), unit)
     return estimates
+
+
+def _at_end(parameter: Parameter, value: float) -> float:
+    """Return the bound, or no effect, that a value comes to but for rounding; else the value."""
+    ends = (parameter.nominal, parameter.low, parameter.high)
+    return next((end for end in ends if abs(value - end) < ROUNDING * parameter.scale), value)
 
 
 def _unfitted(problem: Problem, score: Score, others: Sequence[Score], why: str) -> Candidate:

@@ -25,6 +25,7 @@ from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import cut_ever_longer, cut_longer
 from garat_jax.diagnosis.judge import (
+    ANOTHER_MAY_HELP,
     Judged,
     estimates,
     judge,
@@ -50,6 +51,8 @@ from garat_jax.diagnosis.steps import Step, prune, reconsider, refitted
 from garat_jax.diagnosis.timestep import count_timestep
 
 ROUNDS = 5
+AS_GOOD = "as good as what was added, beside what else was found"
+"""Why a candidate that failed a gate for another's sake is no worse in the end."""
 
 
 class Outcome(NamedTuple):
@@ -301,14 +304,26 @@ def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
 
 
 def _as_shown(problem: Problem, steps: Sequence[Step], final: Fit) -> dict[Named, Candidate]:
-    """Return the selected effects, and their other names, with their sizes from the final fit."""
+    """Return the selected effects and what is not told from them.
+
+    Sizes are those of the final fit where one fit serves both, else those of the round.
+    """
     shown = {}
     for step in steps:
+        own, equals = step.candidate.named, step.candidate.indistinguishable_from
         for candidate, contender in [(step.candidate, step.contender), *step.alike]:
-            fit = final
+            fit, named = final, candidate.named
             if contender is not step.contender:
                 fit = under_another_name(problem, final, step.contender, contender)
+            if fit is None and named not in equals:
+                continue
             if fit is not None:
                 sizes = estimates(problem, contender.score.effect, fit)
-                shown[candidate.named] = dataclasses.replace(candidate, parameters=sizes)
+                candidate = dataclasses.replace(candidate, parameters=sizes)
+            if named in equals and len(steps) > 1 and candidate.why in ANOTHER_MAY_HELP:
+                others = (own, *(other for other in equals if other != named))
+                candidate = dataclasses.replace(
+                    candidate, why=AS_GOOD, indistinguishable_from=others
+                )
+            shown[named] = candidate
     return shown

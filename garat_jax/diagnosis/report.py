@@ -91,10 +91,12 @@ def _verdict(diagnosis: Diagnosis) -> str:
         f"the error on recordings held out{over} falls from {_percent(error.before)} to "
         f"{_percent(error.after)} of the signals' spread; {floor}"
     )
+    them = "it" if len(diagnosis.selected) == 1 else "them"
     if diagnosis.verdict == "missing_effect":
-        return f"The model lacks {names}. With it, {fall}."
+        return f"The model lacks {names}. With {them}, {fall}."
     if names:
-        return f"The model lacks {names}, but that is not all. With it, {fall}: {diagnosis.rest}."
+        rest = f"With {them}, {fall}: {diagnosis.rest}."
+        return f"The model lacks {names}, but that is not all. {rest}"
     if rivals := diagnosis.rivals(label):
         return (
             f"Something is missing, but none of {rivals} explains more than the others for "
@@ -305,8 +307,8 @@ def _where(places: Sequence[Place], view: View) -> list[Section]:
             figures=[
                 Figure(
                     figures.missing_torques(view.missing, view.explained, dof, unit),
-                    "Grey: every sample. Black: their mean in bins that hold equally many."
-                    + (" Blue: the effects that were found." if law else ""),
+                    "Grey: samples, but for a few far out. Black: their mean in bins that hold "
+                    "equally many." + (" Blue: the effects that were found." if law else ""),
                 )
             ],
         ),

@@ -10,10 +10,12 @@ from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Candidate, Interval, Named
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon
+from garat_jax.diagnosis.judge import BEHIND
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.names import renamed
 from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.rank import AS_GOOD, _as_shown
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
@@ -139,6 +141,16 @@ def test_what_cannot_be_told_from_it_beside_the_others_is_named(problem):
     assert [step.effect for step in steps] == [DAMPING, OFFSET]
     assert steps[0].candidate.indistinguishable_from == (Named("back_emf", MOTOR),)
     assert current is before
+
+
+def test_what_was_behind_alone_and_is_as_good_in_the_end_is_said_to_be(problem):
+    steps, current, _ = reconsidered(problem, DAMPING, EMF, OFFSET, named=False)
+    ((behind, fitted),) = steps[0].alike
+    behind = dataclasses.replace(behind, passes=False, why=BEHIND)
+    steps[0] = steps[0]._replace(alike=[(behind, fitted)])
+    shown = _as_shown(problem, steps, current)[behind.named]
+    assert shown.why == AS_GOOD
+    assert shown.indistinguishable_from == (Named("viscous_damping", AT),)
 
 
 def test_another_name_of_what_was_added_needs_no_fit_of_its_own(problem):
