@@ -41,7 +41,8 @@ class Step(NamedTuple):
         candidate: What was said of it.
         contender: How it was fitted then.
         fit: The fit with it and those before it.
-        alike: What did much the same then, whether the recordings told it from this or not.
+        alike: What did much the same then, whether the recordings told it from this or not, and
+            what was tried in its place since.
     """
 
     candidate: Candidate
@@ -125,8 +126,9 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
                     say(f"trying {candidate.named} instead of {step.candidate.named}")
                     trial = _fit_instead(problem, fitted, others, contender)
                 trials.append((candidate, dataclasses.replace(contender, fit=trial)))
-        trials += _newcomers(problem, metric, step, fitted, others, say)
-        found[place], fitted = _best_of(problem, metric, step, fitted, trials, say)
+        new = _newcomers(problem, metric, step, fitted, others, say)
+        step = step._replace(alike=[*step.alike, *new])
+        found[place], fitted = _best_of(problem, metric, step, fitted, [*trials, *new], say)
     if fitted is current:
         return found, current
     kept, fitted = prune(problem, found, fitted, found, say)
@@ -147,7 +149,8 @@ def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others
     rival = fitted.cost[problem.fitted].sum()
     new = [fit_one(problem, without, score, rival, say) for score in ahead]
     new = with_twins(problem, without, scores, new, say)
-    new = with_evidence(problem, without, new, len(scores))
+    num_tests = len([score for score in scores if not score.excluded])
+    new = with_evidence(problem, without, new, num_tests)
     floor = noise_floor(problem, metric, fitted)
     return [pair for pair in judge(problem, metric, without, scores, new, floor) if pair[1]]
 

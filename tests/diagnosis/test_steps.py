@@ -116,6 +116,7 @@ def test_an_effect_gives_way_to_what_comes_first_only_beside_what_was_found_sinc
         Named("viscous_damping", AT), Named("back_emf", MOTOR)
     }  # fmt: skip
     assert steps[0].candidate.passes
+    assert {*alike} <= {other.named for other, _ in steps[0].alike}
     assert current.theta[first] == pytest.approx(DAMPED, rel=0.05)
     assert current.theta[DRAG] == 0.0
 
