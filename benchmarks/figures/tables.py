@@ -306,6 +306,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "hidden_effects_seed_4": functools.partial(hidden_effects, 4),
     "hidden_effects_seed_5": functools.partial(hidden_effects, 5),
     "hidden_effects_seed_6": functools.partial(hidden_effects, 6),
+    "hidden_effects_seed_7": functools.partial(hidden_effects, 7),
     "timing": timing,
     "real_data": real_data,
     "ground": ground,

@@ -92,26 +92,26 @@ def choose(
         say(f"looking for what would be missing beside {candidate.named}")
         followed.append(Path(candidate, contender, follow(contender)))
     if not followed:
-        return judged, _first_step(problem, judged, current)
+        return judged, first_step(problem, judged, current)
     best = min(followed, key=lambda path: path.fit.cost.sum())
     known = [k.fit for first, k in judged[:1] if k and first.passes]
     gains = best.second and is_certain(held_out_gain(problem, metric, current, best.fit))
     if not gains or not all(leads(problem, best.fit, fit) for fit in known):
-        return judged, _first_step(problem, judged, current)
+        return judged, first_step(problem, judged, current)
     others = [path for path in followed if not best.is_like(path)]
     undecided = [best, *(path for path in others if not leads(problem, best.fit, path.fit))]
     shared = _shared(undecided, judged)
     if shared is None:
-        return judged, _first_step(problem, judged, current)
+        return judged, first_step(problem, judged, current)
     first, contender, is_second = shared
     itself = {first.named, *first.indistinguishable_from}
     added = dict.fromkeys(c.named for path in undecided for c in path.added)
     why = TOGETHER + " or ".join(str(named) for named in added if named not in itself)
     first = dataclasses.replace(first, passes=True, why=why)
     judged = [(first, contender), *(pair for pair in judged if pair[1] is not contender)]
-    steps = _first_step(problem, judged, current)
+    steps = first_step(problem, judged, current)
     if len(undecided) == 1 or is_second:
-        steps += _first_step(problem, best.then, best.contender.fit)
+        steps += first_step(problem, best.then, best.contender.fit)
     return judged, steps
 
 
@@ -175,7 +175,7 @@ def _one_of_each(fitted: Sequence[tuple[Candidate, Contender]]):
     return kept
 
 
-def _first_step(problem: Problem, judged: Judged, current: Fit) -> list[Step]:
+def first_step(problem: Problem, judged: Judged, current: Fit) -> list[Step]:
     """Return a round's first candidate as a step from the fit before it, if it passes."""
     steps = []
     for first, contender in judged[:1]:

@@ -20,8 +20,7 @@ from garat_jax.diagnosis.starts import Fit
 from garat_jax.diagnosis.timestep import count_timestep
 
 CONTENDERS = 4
-"""How many candidates are fitted each round, those that are like the first counted as one, besides
-those that turn out to be like the best."""
+"""How many candidates are fitted each round; see `fit_contenders`."""
 FIRM = 2.0
 """Half-widths of its 95 % interval by which a parameter that screening left out must differ from no
 effect, at a timestep of 0, to be fitted in the end."""
@@ -53,6 +52,7 @@ def fit_contenders(
     refinable: Sequence[int],
     scores: Sequence[Score],
     say: Callable[[str], None],
+    num: int = CONTENDERS,
 ) -> list[Contender]:
     """Fit the candidates that may be the missing effect.
 
@@ -62,6 +62,8 @@ def fit_contenders(
         refinable: Indices of those of them in whose place a refinement may come.
         scores: What screening says, best first.
         say: Told what is being done.
+        num: How many, those that are like the first counted as one, besides those that turn out to
+            be like the best.
     """
     contenders = _fit_refined(problem, current, refinable, scores, say)
     done = {c.score.effect for c in contenders}
@@ -70,7 +72,7 @@ def fit_contenders(
     likely = [s for s in likely if s.share > 0.25 * likely[0].share]
     likely = [s for s in likely if not simpler_law(problem, s, likely)]
     likely = [s for i, s in enumerate(likely) if not twins(s, likely[:i])]
-    for score in _first_of(likely):
+    for score in _first_of(likely, num):
         rival = min((c.fit.cost[problem.fitted].sum() for c in contenders), default=np.inf)
         hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
@@ -97,12 +99,12 @@ def best_of(contenders: Sequence[Contender]) -> Contender | None:
     return min(contenders, key=lambda contender: contender.fit.cost.sum(), default=None)
 
 
-def _first_of(likely: Sequence[Score]) -> list[Score]:
+def _first_of(likely: Sequence[Score], num: int) -> list[Score]:
     """Return the first candidates that are not like the very first, and all that are."""
     chosen, num_others = [], 0
     for score in likely:
         is_alike = score is likely[0] or cosine(score, likely[0]) > EQUIVALENT
-        if is_alike or num_others < CONTENDERS - 1:
+        if is_alike or num_others < num - 1:
             chosen.append(score)
         num_others += not is_alike
     return chosen

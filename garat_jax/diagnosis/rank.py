@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.ahead import choose
+from garat_jax.diagnosis.ahead import choose, first_step
 from garat_jax.diagnosis.contend import (
+    CONTENDERS,
     Contender,
     complete,
     fit_contenders,
@@ -51,6 +52,11 @@ from garat_jax.diagnosis.steps import Step, prune, reconsider, refitted
 from garat_jax.diagnosis.timestep import count_timestep
 
 ROUNDS = 5
+FOLLOWED = 2
+"""Candidates that are fitted beside each rival that is followed for one more effect."""
+LOOK_AHEAD = 2
+"""Effects found from which rivals are not followed any more: what then does not pass by itself is
+more than a pair that explains each other."""
 AS_GOOD = "as good as what was added, beside what else was found"
 """Why a candidate that failed a gate for another's sake is no worse in the end."""
 
@@ -210,7 +216,10 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         say(f"scoring the candidates, round {number + 1}")
         judged = _round(problem, metric, current, held, floor, say, refinable=held)
         follow = functools.partial(_follow, problem, metric, held, say)
-        judged, chosen = choose(problem, metric, current, judged, follow, say)
+        if len(held) < LOOK_AHEAD:
+            judged, chosen = choose(problem, metric, current, judged, follow, say)
+        else:
+            chosen = first_step(problem, judged, current)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         contender = judged[0][1] if judged else None
         best = contender.fit if contender is not None else best
@@ -242,6 +251,7 @@ def _round(
     say: Callable[[str], None],
     refinable: Sequence[int] = (),
     above: float = ABOVE_FLOOR,
+    num: int = CONTENDERS,
 ) -> Judged:
     """Screen the candidates, fit the likely ones and judge them all.
 
@@ -254,10 +264,11 @@ def _round(
         say: Told what is being done.
         refinable: Those of them in whose place a refinement may come.
         above: Multiple of the floor above which candidates are fitted.
+        num: How many are; see `fit_contenders`.
     """
     gap = is_above(problem, metric, current, floor, above)
     scores = screen(problem, current, held)
-    contenders = fit_contenders(problem, current, refinable, scores, say) if gap else []
+    contenders = fit_contenders(problem, current, refinable, scores, say, num) if gap else []
     contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
     contenders = refine(problem, metric, current, scores, contenders, floor, say)
     contenders = fill_out(problem, metric, contenders, floor, say)
@@ -275,7 +286,7 @@ def _follow(problem: Problem, metric: Metric, held, say, contender: Contender) -
     """
     effects = [*held, contender.score.effect]
     floor = noise_floor(problem, metric, contender.fit)
-    return _round(problem, metric, contender.fit, effects, floor, say, above=AT_FLOOR)
+    return _round(problem, metric, contender.fit, effects, floor, say, above=AT_FLOOR, num=FOLLOWED)
 
 
 def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:

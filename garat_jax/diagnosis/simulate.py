@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from garat_jax import dynamics
-from garat_jax.compiler_options import OPTIMISATION_LEVEL
+from garat_jax.compiler_options import FUSION_EMITTERS, OPTIMISATION_LEVEL
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.past import Past, has_memory_of_motion, lead_steps, way_to
 from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
@@ -29,8 +29,10 @@ BATCH_SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
 substep, many simulations share its cost. Each size is compiled once."""
 
-UNOPTIMISED = {OPTIMISATION_LEVEL: 0}
-"""Of programs that wait for C MuJoCo: to optimise what is around it takes longer than it saves."""
+FEW = 4
+"""Up to so many candidates act in a program that fits them, which runs often. Those of screening,
+in which many act, run a few times: to optimise what is around C MuJoCo takes longer than it
+saves."""
 
 
 class Slot(NamedTuple):
@@ -122,7 +124,6 @@ class Simulator:
         looking = [i for i, e in enumerate(replayed) if e.reads_state or e.notes]
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
         self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
-        self._compiler_options = dict(UNOPTIMISED) if self._alone.engine == "mujoco" else {}
         self._transform = model.transform
         self._any_at_once = dynamics.steps_at_once(self._alone) and model.transform is None
         self._jitted = functools.lru_cache(NUM_PROGRAMS)(self._jit)
@@ -263,7 +264,10 @@ class Simulator:
         one = functools.partial(predict, world, chosen)
         past = Past._make((None, None, 0, 0)) if looks_back else None
         axes = (0, 0, 0, 0, past, 0)[: 6 if way == "along" else 5]
-        run = jax.jit(jax.vmap(one, axes), compiler_options=self._compiler_options)
+        options = {}
+        if self._alone.engine == "mujoco":
+            options = {OPTIMISATION_LEVEL: 1 if len(chosen) <= FEW else 0, FUSION_EMITTERS: False}
+        run = jax.jit(jax.vmap(one, axes), compiler_options=options)
         return Program(run, looks_back, way == "stepped")
 
     def _in_batches(self, program: Program, segments: Segments, theta, start, path=None):

@@ -1,11 +1,12 @@
 """What is added where no candidate passes by itself, by what each leads to with another."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis import ahead
+from garat_jax.diagnosis import ahead, rank
 from garat_jax.diagnosis.ahead import choose
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Candidate, Interval, Named
@@ -130,3 +131,15 @@ def test_of_rivals_that_are_alike_one_is_followed():
     like_them = [candidate(FRICTION, OFFSET), candidate(GRAVITY, DAMPING)]
     kept = ahead._one_of_each([(c, None) for c in (*rivals, *like_them)])
     assert [c for c, _ in kept] == rivals
+
+
+@pytest.mark.parametrize(("num_found", "is_looking"), [(0, True), (1, True), (2, False)])
+def test_with_two_effects_found_rivals_are_not_followed(monkeypatch, num_found, is_looking):
+    looked = []
+    monkeypatch.setattr(rank, "make_metric", lambda problem: None)
+    monkeypatch.setattr(rank, "is_above", lambda *of: True)
+    monkeypatch.setattr(rank, "_round", lambda *of, **settings: [])
+    monkeypatch.setattr(rank, "choose", lambda *of: looked.append(of) or ([], []))
+    found = [SimpleNamespace(effect=effect) for effect in range(num_found)]
+    rank._select(None, None, None, found, lambda line: None)
+    assert bool(looked) == is_looking

@@ -131,8 +131,10 @@ def test_of_many_that_are_like_the_first_none_takes_the_place_of_another():
 
     alike = [scored(i, 0.9 - 0.1 * i, 1.0, 0.01 * i, 0.0) for i in range(5)]
     others = [scored(5 + i, 0.3 - 0.01 * i, 0.0, 1.0, float(i)) for i in range(4)]
-    chosen = contend._first_of([*alike[:3], others[0], *alike[3:], *others[1:]])
+    likely = [*alike[:3], others[0], *alike[3:], *others[1:]]
+    chosen = contend._first_of(likely, contend.CONTENDERS)
     assert [score.effect for score in chosen] == [0, 1, 2, 5, 3, 4, 6, 7]
+    assert [score.effect for score in contend._first_of(likely, 2)] == [0, 1, 2, 5, 3, 4]
 
 
 def test_what_is_like_the_one_that_fits_best_is_fitted_wherever_it_was_placed(monkeypatch):
@@ -151,6 +153,6 @@ def test_what_is_like_the_one_that_fits_best_is_fitted_wherever_it_was_placed(mo
         fitted = dataclasses.replace(current, residual=left[score.effect] * current.residual)
         return contend.Contender(score, fitted)
 
-    monkeypatch.setattr(contend, "_fit", fit)
+    monkeypatch.setattr(contend, "fit_one", fit)
     fitted = fit_contenders(problem, current, (), scores, print)
     assert [contender.score.effect for contender in fitted] == [0, 1, 2, 3, 5]
