@@ -35,6 +35,22 @@ def options_for(engine: str, depth: int) -> dict[str, Any]:
         options = {OPTIMISATION_LEVEL: 1}
     elif depth >= DEEP_CHAIN:
         options = {FUSION_EMITTERS: False}
+    return _free(options)
+
+
+def options_of_replay(engine: str, runs_often: bool) -> dict[str, Any]:
+    """Return XLA's options for a program that replays recordings, one of dozens in a diagnosis.
+
+    Around C MuJoCo the fusion emitters take longer to compile than they save, and so does any
+    optimisation of a program that runs only a few times; see docs/performance.md.
+    """
+    if engine != "mujoco" or jax.default_backend() != "cpu":
+        return {}
+    return _free({OPTIMISATION_LEVEL: int(runs_often), FUSION_EMITTERS: False})
+
+
+def _free(options: dict[str, Any]) -> dict[str, Any]:
+    """Return those options that the user's XLA_FLAGS leave open and the installed XLA knows."""
     flags = os.environ.get("XLA_FLAGS", "")
     return {k: v for k, v in options.items() if k not in flags and is_known_option(k, v)}
 

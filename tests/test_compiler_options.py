@@ -30,6 +30,18 @@ def test_only_deep_chains_in_mjx_are_compiled_without_fusion_emitters(monkeypatc
     assert compiler_options.compiler_options(make_chain(6)) == {}
 
 
+def test_programs_of_a_diagnosis_are_optimised_only_if_they_run_often(monkeypatch):
+    level, emitters = compiler_options.OPTIMISATION_LEVEL, compiler_options.FUSION_EMITTERS
+    for runs_often in (False, True):
+        options = compiler_options.options_of_replay("mujoco", runs_often)
+        assert options == {level: int(runs_often), emitters: False}
+    assert compiler_options.options_of_replay("mjx", runs_often=True) == {}
+    monkeypatch.setenv("XLA_FLAGS", f"--{emitters}=true")
+    assert compiler_options.options_of_replay("mujoco", runs_often=False) == {level: 0}
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert compiler_options.options_of_replay("mujoco", runs_often=True) == {}
+
+
 def test_the_users_own_flag_is_left_alone(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", f"--{compiler_options.FUSION_EMITTERS}=true")
     assert compiler_options.compiler_options(make_chain(6)) == {}

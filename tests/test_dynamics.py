@@ -22,7 +22,7 @@ from garat_jax.effects import (
     RotorInertia,
     ViscousDamping,
 )
-from garat_jax.engine import _Simulations, profiling_clock
+from garat_jax.engine import _Simulations
 from garat_jax.errors import UserError
 from garat_jax.setconst import set_const
 from tests.models import ARM, MUSCLE, PENDULUM, TUMBLER, showing, spec
@@ -398,21 +398,3 @@ def test_kinds_at_one_target_are_pytrees_of_their_own():
     ]
     for i, structure in enumerate(structures):
         assert all(structure != other for other in structures[:i])
-
-
-def test_a_model_of_one_tree_is_not_searched_for_islands_and_no_clock_is_read():
-    floating = "<body><freejoint/><geom type='sphere' size='1' mass='1'/></body>"
-    two = ARM.replace("</worldbody>", f"{floating}</worldbody>")
-    flags = [compiled(mjcf, engine="mujoco").host.model.opt.disableflags for mjcf in (ARM, two)]
-    islands = int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-    assert [flag & islands for flag in flags] == [islands, 0]
-    clock = profiling_clock()
-    if clock is None:
-        pytest.skip("MuJoCo's library does not show its clock on this platform")
-    assert clock.value is None
-    mujoco.set_mjcb_time(lambda: 1.0)
-    try:
-        assert clock.value is not None
-    finally:
-        mujoco.set_mjcb_time(None)
-        clock.value = None

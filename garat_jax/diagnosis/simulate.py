@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from garat_jax import dynamics
-from garat_jax.compiler_options import FUSION_EMITTERS, OPTIMISATION_LEVEL
+from garat_jax.compiler_options import options_of_replay
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.past import Past, has_memory_of_motion, lead_steps, way_to
 from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
@@ -30,9 +30,8 @@ BATCH_SIZES = (256, 1024)
 substep, many simulations share its cost. Each size is compiled once."""
 
 FEW = 4
-"""Up to so many candidates act in a program that fits them, which runs often. Those of screening,
-in which many act, run a few times: to optimise what is around C MuJoCo takes longer than it
-saves."""
+"""Up to so many candidates act in a program that fits them, which runs often; in those of
+screening, which run a few times, many act."""
 
 
 class Slot(NamedTuple):
@@ -264,9 +263,7 @@ class Simulator:
         one = functools.partial(predict, world, chosen)
         past = Past._make((None, None, 0, 0)) if looks_back else None
         axes = (0, 0, 0, 0, past, 0)[: 6 if way == "along" else 5]
-        options = {}
-        if self._alone.engine == "mujoco":
-            options = {OPTIMISATION_LEVEL: 1 if len(chosen) <= FEW else 0, FUSION_EMITTERS: False}
+        options = options_of_replay(self._alone.engine, runs_often=len(chosen) <= FEW)
         run = jax.jit(jax.vmap(one, axes), compiler_options=options)
         return Program(run, looks_back, way == "stepped")
 
