@@ -39,7 +39,7 @@ def use(device: str) -> list[Any]:
     _prefer(device)
     try:
         devices = jax.devices()
-    except RuntimeError as error:
+    except (AssertionError, RuntimeError) as error:  # the former if CUDA's plugin is not there
         raise describe(error) from error
     if device not in ("auto", platform := devices[0].platform):
         raise UserError(
@@ -98,11 +98,11 @@ def _or_variable(number: int | None, variable: str) -> int | None:
     return int(text) if number is None and text else number
 
 
-def describe(error: RuntimeError) -> UserError:
+def describe(error: Exception) -> UserError:
     """Turn JAX's complaint about a device into one for the user."""
     reason = str(error).partition("\n")[0].partition(" (set JAX_PLATFORMS")[0].rstrip(".")
     wanted = str(jax.config.jax_platforms).partition(",")[0]  # pyright: ignore[reportAttributeAccessIssue]
-    if wanted == "gpu" and "known backends" in reason:  # JAX names ROCm, whichever is lacking
+    if wanted in ("gpu", "cuda") and (not reason or "known backends" in reason):  # JAX names ROCm
         reason = "no backend for it is installed; pip install 'garat_jax[cuda]' brings NVIDIA's"
     return UserError(
         f"JAX finds no device {wanted!r} ({reason}); "

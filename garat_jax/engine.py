@@ -46,7 +46,7 @@ class HostModel:
     Attributes:
         model: The model. Its automatic reset on bad states is off: a simulation that diverges
             stays diverged in both engines, and the caller sees it. One of a single tree is not
-            searched for islands, of which it has one: that takes a tenth of a step in contact.
+            searched for islands, of which it has one.
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -245,20 +245,21 @@ def profiling_clock() -> ctypes.c_void_p | None:
     It is a variable of MuJoCo's library: to set it sets the clock, None takes it away. None where
     the variable cannot be reached.
     """
-    bindings = mujoco._functions.__file__  # linked against the library, so they find its symbols
     try:
+        bindings = mujoco._functions.__file__  # linked against the library: they find its symbols
         return ctypes.c_void_p.in_dll(ctypes.CDLL(bindings), "mjcb_time")
-    except (OSError, ValueError):  # ValueError: there is no such symbol
+    except (AttributeError, OSError, ValueError):  # ValueError: there is no such symbol
         return None
 
 
 @functools.cache
 def _stop_profiling() -> None:
-    """Take MuJoCo's clock away: reading it is up to a third of a small model's step.
+    """Take MuJoCo's clock away, unless it is the user's: to read it is up to a quarter of a step.
 
-    `mujoco.set_mjcb_time(None)` would set the clock of MuJoCo's Python package instead.
+    `mujoco.set_mjcb_time(None)` would set the clock of MuJoCo's Python package instead. Nothing may
+    step a model meanwhile, for MuJoCo looks at the pointer twice.
     """
-    if clock := profiling_clock():
+    if mujoco.get_mjcb_time() is None and (clock := profiling_clock()):
         clock.value = None
 
 
