@@ -27,6 +27,9 @@ from garat_jax.diagnosis.steps import Step
 
 RIVALS = 2
 """How many candidates behind the first are followed for one more effect."""
+LOOK_AHEAD = 2
+"""Effects held from which rivals are not followed any more: each path is a round of its own, and
+rounds take longer with every effect held."""
 TOGETHER = "passes every gate together with "
 
 
@@ -68,6 +71,7 @@ def choose(
     metric: Metric,
     current: Fit,
     judged: Judged,
+    num_held: int,
     follow: Callable[[Contender], Judged],
     say: Callable[[str], None],
 ) -> tuple[Judged, list[Step]]:
@@ -78,6 +82,7 @@ def choose(
         metric: Of the errors.
         current: The fit of the effects selected so far.
         judged: The candidates, best first.
+        num_held: How many effects are selected so far.
         follow: Returns the round that would follow one.
         say: Told what is being done.
 
@@ -88,7 +93,7 @@ def choose(
         as much; a next round may tell these.
     """
     followed = []
-    for candidate, contender in _rivals(problem, metric, judged)[: 1 + RIVALS]:
+    for candidate, contender in _rivals(problem, metric, judged, num_held)[: 1 + RIVALS]:
         say(f"looking for what would be missing beside {candidate.named}")
         followed.append(Path(candidate, contender, follow(contender)))
     if not followed:
@@ -148,10 +153,13 @@ def _shared(undecided: Sequence[Path], judged: Judged) -> tuple[Candidate, Conte
     return first, best.contender, True
 
 
-def _rivals(problem: Problem, metric: Metric, judged: Judged) -> list[tuple[Candidate, Contender]]:
+def _rivals(
+    problem: Problem, metric: Metric, judged: Judged, num_held: int
+) -> list[tuple[Candidate, Contender]]:
     """Return the candidates of which another effect may make the first, with their fits.
 
-    Where one passes, these are the laws that it refines, unless it leaves no more than noise.
+    Where one passes, these are the laws that it refines, unless it leaves no more than noise. Where
+    none does, there are none beside `LOOK_AHEAD` effects.
     """
     fitted = [(candidate, contender) for candidate, contender in judged if contender]
     for first, contender in fitted[:1]:
@@ -160,7 +168,7 @@ def _rivals(problem: Problem, metric: Metric, judged: Judged) -> list[tuple[Cand
             is_open = is_above(problem, metric, contender.fit, floor, AT_FLOOR)
             own = contender.score.effect
             return [(c, k) for c, k in fitted if is_open and refines(problem, own, k.score.effect)]
-        if first.why in ANOTHER_MAY_HELP:
+        if first.why in ANOTHER_MAY_HELP and num_held < LOOK_AHEAD:
             return _one_of_each(fitted)
     return []
 

@@ -26,7 +26,8 @@ which the effect acts shows next to no change."""
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 ROUNDING = 1e-9
-"""Distance from a bound, relative to a parameter's `scale`, that is only rounding."""
+"""Distance from a bound, relative to a parameter's `scale`, that is only rounding: descents
+reach bounds by adding steps."""
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
 BEHIND = "another explains more for certain"
 NO_CERTAIN_GAIN = "the held-out error does not fall for certain"

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.ahead import choose, first_step
+from garat_jax.diagnosis.ahead import choose
 from garat_jax.diagnosis.contend import (
     CONTENDERS,
     Contender,
@@ -25,12 +25,7 @@ from garat_jax.diagnosis.contend import (
 from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import cut_ever_longer, cut_longer
-from garat_jax.diagnosis.judge import (
-    ANOTHER_MAY_HELP,
-    Judged,
-    estimates,
-    judge,
-)
+from garat_jax.diagnosis.judge import Judged, estimates, judge
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import (
     ABOVE_FLOOR,
@@ -54,11 +49,8 @@ from garat_jax.diagnosis.timestep import count_timestep
 ROUNDS = 5
 FOLLOWED = 2
 """Candidates that are fitted beside each rival that is followed for one more effect."""
-LOOK_AHEAD = 2
-"""Effects found from which rivals are not followed any more: what then does not pass by itself is
-more than a pair that explains each other."""
 AS_GOOD = "as good as what was added, beside what else was found"
-"""Why a candidate that failed a gate for another's sake is no worse in the end."""
+"""Why a candidate that failed a gate by itself is no worse in the end."""
 
 
 class Outcome(NamedTuple):
@@ -216,10 +208,7 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         say(f"scoring the candidates, round {number + 1}")
         judged = _round(problem, metric, current, held, floor, say, refinable=held)
         follow = functools.partial(_follow, problem, metric, held, say)
-        if len(held) < LOOK_AHEAD:
-            judged, chosen = choose(problem, metric, current, judged, follow, say)
-        else:
-            chosen = first_step(problem, judged, current)
+        judged, chosen = choose(problem, metric, current, judged, len(held), follow, say)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         contender = judged[0][1] if judged else None
         best = contender.fit if contender is not None else best
@@ -319,22 +308,23 @@ def _as_shown(problem: Problem, steps: Sequence[Step], final: Fit) -> dict[Named
 
     Sizes are those of the final fit where one fit serves both, else those of the round.
     """
-    shown = {}
+    shown, selected = {}, [step.candidate.named for step in steps]
     for step in steps:
         own, equals = step.candidate.named, step.candidate.indistinguishable_from
         for candidate, contender in [(step.candidate, step.contender), *step.alike]:
             fit, named = final, candidate.named
             if contender is not step.contender:
+                if named in selected:  # in an earlier one's place, since this was held against it
+                    continue
                 fit = under_another_name(problem, final, step.contender, contender)
             if fit is None and named not in equals:
                 continue
             if fit is not None:
                 sizes = estimates(problem, contender.score.effect, fit)
                 candidate = dataclasses.replace(candidate, parameters=sizes)
-            if named in equals and len(steps) > 1 and candidate.why in ANOTHER_MAY_HELP:
+            if named in equals and len(steps) > 1:
                 others = (own, *(other for other in equals if other != named))
-                candidate = dataclasses.replace(
-                    candidate, why=AS_GOOD, indistinguishable_from=others
-                )
+                why = candidate.why if candidate.passes else AS_GOOD
+                candidate = dataclasses.replace(candidate, why=why, indistinguishable_from=others)
             shown[named] = candidate
     return shown

@@ -30,8 +30,8 @@ BATCH_SIZES = (256, 1024)
 substep, many simulations share its cost. Each size is compiled once."""
 
 FEW = 4
-"""Up to so many candidates act in a program that fits them, which runs often; in those of
-screening, which run a few times, many act."""
+"""Candidates up to which a program is optimised. In those that fit them, which run often, few act;
+in those of screening, which run a few times, as many as a model has places for them."""
 
 
 class Slot(NamedTuple):

@@ -136,7 +136,11 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
 
 
 def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others, say) -> Judged:
-    """Fit what screening would put before a step now, in its place, if that was not tried yet."""
+    """Fit what screening would put before a step now, in its place, if that was not tried yet.
+
+    Returns:
+        What was fitted, judged beside the step's own effect.
+    """
     say(f"looking for what would explain more than {step.candidate.named}")
     without = _fit_only(problem, fitted, others)
     scores = screen(problem, without, others)
@@ -149,10 +153,12 @@ def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others
     rival = fitted.cost[problem.fitted].sum()
     new = [fit_one(problem, without, score, rival, say) for score in ahead]
     new = with_twins(problem, without, scores, new, say)
+    new += [Contender(score, fitted) for score in scores if new and score.effect == step.effect]
     num_tests = len([score for score in scores if not score.excluded])
     new = with_evidence(problem, without, new, num_tests)
     floor = noise_floor(problem, metric, fitted)
-    return [pair for pair in judge(problem, metric, without, scores, new, floor) if pair[1]]
+    judged = judge(problem, metric, without, scores, new, floor)
+    return [(c, k) for c, k in judged if k and k.score.effect != step.effect]
 
 
 def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, say):

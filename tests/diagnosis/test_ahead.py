@@ -1,12 +1,11 @@
 """What is added where no candidate passes by itself, by what each leads to with another."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis import ahead, rank
+from garat_jax.diagnosis import ahead
 from garat_jax.diagnosis.ahead import choose
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Candidate, Interval, Named
@@ -40,6 +39,8 @@ def chosen(
     second_of_damping: dict[int, float],
     second_of_gravity: dict[int, float],
     why: str = NO_CERTAIN_LEAD,
+    num_held: int = 0,
+    why_first: str = NO_CERTAIN_GAIN,
 ):
     """Choose where damping, gravity and an offset explain 20, 19 and 18 % each by itself.
 
@@ -48,6 +49,8 @@ def chosen(
         second_of_damping: What the best effect beside damping leaves of the residual.
         second_of_gravity: And beside gravity. Beside the offset nothing passes.
         why: What is said of these.
+        num_held: How many effects are said to be selected.
+        why_first: What is said of damping.
     """
     current = settle(problem, problem.simulator.base, problem.segments.start)
     residual = np.random.default_rng(0).normal(size=current.residual.shape)
@@ -72,12 +75,13 @@ def chosen(
         return [pair(effect, left, why) for effect, left in beside.items()]
 
     judged = [
-        pair(DAMPING, 0.80, NO_CERTAIN_GAIN),
+        pair(DAMPING, 0.80, why_first),
         pair(GRAVITY, 0.81, NO_CERTAIN_LEAD),
         pair(OFFSET, 0.82, NO_CERTAIN_LEAD),
     ]
     metric = make_metric(problem)
-    judged, steps = choose(problem, metric, current, judged, follow, lambda message: None)
+    say = [].append
+    judged, steps = choose(problem, metric, current, judged, num_held, follow, say)
     return judged[0][0], [step.candidate.named for step in steps]
 
 
@@ -133,13 +137,14 @@ def test_of_rivals_that_are_alike_one_is_followed():
     assert [c for c, _ in kept] == rivals
 
 
-@pytest.mark.parametrize(("num_found", "is_looking"), [(0, True), (1, True), (2, False)])
-def test_with_two_effects_found_rivals_are_not_followed(monkeypatch, num_found, is_looking):
-    looked = []
-    monkeypatch.setattr(rank, "make_metric", lambda problem: None)
-    monkeypatch.setattr(rank, "is_above", lambda *of: True)
-    monkeypatch.setattr(rank, "_round", lambda *of, **settings: [])
-    monkeypatch.setattr(rank, "choose", lambda *of: looked.append(of) or ([], []))
-    found = [SimpleNamespace(effect=effect) for effect in range(num_found)]
-    rank._select(None, None, None, found, lambda line: None)
-    assert bool(looked) == is_looking
+@pytest.mark.parametrize(("num_held", "is_looking"), [(0, True), (1, True), (2, False)])
+def test_beside_two_effects_rivals_are_not_followed(problem, num_held, is_looking):
+    first, added = chosen(problem, {OFFSET: 0.3}, {OFFSET: 0.5}, num_held=num_held)
+    assert first.passes == bool(added) == is_looking
+
+
+def test_beside_two_effects_a_law_that_the_first_refines_is_still_followed(problem, monkeypatch):
+    monkeypatch.setattr(ahead, "refines", lambda problem, one, other: other == GRAVITY != one)
+    monkeypatch.setattr(ahead, "is_above", lambda *of: True)
+    _, added = chosen(problem, {}, {OFFSET: 0.3}, num_held=2, why_first=PASSES)
+    assert added[0] == named(GRAVITY)

@@ -7,7 +7,7 @@ import pytest
 
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Interval
-from garat_jax.diagnosis.judge import is_certain, judge
+from garat_jax.diagnosis.judge import _at_end, is_certain, judge
 from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
@@ -137,3 +137,12 @@ def test_a_fall_is_certain_if_no_resample_rises_by_more_than_a_trifle_of_it():
     assert not is_certain(Interval(1.0, -0.1, 2.0))
     assert not is_certain(Interval(-1.0, -2.0, 0.1))
     assert not is_certain(Interval(0.0, 0.0, 0.0))
+
+
+def test_a_value_that_is_a_bound_but_for_rounding_is_the_bound():
+    *_, phase = CoggingTorque.parameters()
+    assert _at_end(phase, phase.high - 1e-12) == phase.high
+    assert _at_end(phase, phase.low + 1e-12) == phase.low
+    assert _at_end(phase, 1e-12) == phase.nominal
+    inside = phase.high - 1e-6
+    assert _at_end(phase, inside) == inside

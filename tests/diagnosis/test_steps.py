@@ -16,7 +16,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.names import renamed
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rank import AS_GOOD, _as_shown
-from garat_jax.diagnosis.screen import Score
+from garat_jax.diagnosis.screen import Score, screen
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -152,6 +152,27 @@ def test_what_was_behind_alone_and_is_as_good_in_the_end_is_said_to_be(problem):
     shown = _as_shown(problem, steps, current)[behind.named]
     assert shown.why == AS_GOOD
     assert shown.indistinguishable_from == (Named("viscous_damping", AT),)
+
+
+def test_what_came_in_an_earlier_ones_place_is_shown_as_what_was_added(problem):
+    steps, current, _ = reconsidered(problem, DAMPING, None, OFFSET)
+    equal = dataclasses.replace(candidate(DAMPING), passes=False, why=BEHIND)
+    later = dataclasses.replace(steps[1].candidate, indistinguishable_from=(equal.named,))
+    steps[1] = steps[1]._replace(candidate=later, alike=[(equal, contender(problem, DAMPING))])
+    shown = _as_shown(problem, steps, current)[equal.named]
+    assert shown.passes
+    assert shown.parameters["coefficient"].estimate == pytest.approx(current.theta[DAMPING])
+
+
+def test_a_newcomer_is_held_against_what_it_would_replace(problem, monkeypatch):
+    def drag_first(*of):
+        return sorted(screen(*of), key=lambda score: score.effect != DRAG)
+
+    monkeypatch.setattr("garat_jax.diagnosis.steps.screen", drag_first)
+    steps, _, _ = reconsidered(problem, DAMPING, None, OFFSET)
+    (newcomer,) = [c for c, k in steps[0].alike if k and k.score.effect == DRAG]
+    assert steps[0].effect == DAMPING
+    assert newcomer.why == BEHIND
 
 
 def test_another_name_of_what_was_added_needs_no_fit_of_its_own(problem):
