@@ -22,7 +22,7 @@ from benchmarks.hidden.generate import (
 )
 from benchmarks.hidden.measure import experiment, measure
 from benchmarks.hidden.robots import ROBOTS
-from benchmarks.hidden.score import NOT_YET, aggregate, score
+from benchmarks.hidden.score import NOT_YET, aggregate, judge, score
 from benchmarks.hidden.secrets import OUTSIDE, SIZES
 from garat_jax.diagnosis import Recording, diagnose, load_model
 from garat_jax.diagnosis.compare import read_recordings
@@ -271,10 +271,10 @@ def scored(truth, *selected, verdict="missing_effect"):
 
 
 def test_several_estimates_of_a_set_do_not_narrow_the_interval():
+    estimate = {"parameter": "motor_gain.scale", "true": 1.0, "low": 0.8, "high": 1.2}
     rows = [
         {"case": f"case {i}", "status": "done", "category": "single", "seconds": 1.0,
-         "estimates": [{"relative_error": 0.01 + 0.1 * (i % 5 == 0), "covered": True,
-                        "held_close": True}]}
+         "estimates": [{**estimate, "estimate": 1.01 + 0.1 * (i % 5 == 0), "held_close": True}]}
         for i in range(20)
     ]  # fmt: skip
     more = [{**row, "estimates": row["estimates"] * 3} for row in rows]
@@ -286,13 +286,21 @@ def test_several_estimates_of_a_set_do_not_narrow_the_interval():
     assert one["interval"] == three["interval"] == pytest.approx([0.584, 0.919], abs=1e-3)
 
 
+@pytest.mark.parametrize(("parameter", "covered"), [("phase", True), ("periods", False)])
+def test_a_phase_a_turn_off_is_the_same_phase(parameter, covered):
+    found = {"true": 3.0, "estimate": -3.28, "low": -3.3, "high": -3.26}
+    judged = judge({"parameter": f"cogging_torque.{parameter}", **found})
+    assert judged["covered"] == judged["close"] == covered
+
+
 def test_scores_count_kind_place_and_intervals():
     case = Case("coulomb_friction-small", "single", ("coulomb_friction",), "small", (0, 1))
     secret = SECRETS["coulomb_friction"]("joint/elbow", {"torque": 0.1})
     truth = Truth(case, "arm2", (secret,), 200.0, 4.0, "white", 0.0, (9.0,))
     right = scored(truth, candidate("coulomb_friction", "joint/elbow", torque=(0.104, 0.09, 0.11)))
-    assert right["ok"] and right["estimates"][0]["covered"]
-    assert right["estimates"][0]["relative_error"] == pytest.approx(0.04)
+    judged = judge(right["estimates"][0])
+    assert right["ok"] and judged["covered"]
+    assert judged["relative_error"] == pytest.approx(0.04)
     alike = [("coulomb_friction", "joint/elbow")]
     honest = scored(truth, candidate("viscous_damping", "joint/shoulder", alike))
     assert honest["ok"] and not honest["alone"] and not honest["estimates"]

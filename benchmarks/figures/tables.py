@@ -170,12 +170,14 @@ def timing() -> str:
                 f"{row['robot']}, 4 × {row['seconds']:g} s, {secret['kind']} {true:g}",
                 f"{row['garat_median']:.1f}",
                 f"{row['limit']:g}",
+                f"{row['garat_with_training_options_median']:.1f}",
                 ", ".join(f"{c['effect']} {_sizes(c)}" for c in row["garat_found"]),
                 f"{row['sysid_median']:.1f}" if ran else "–",
                 f"{theirs['estimate']:.4g} ± {theirs['half_interval']:.2g}" if ran else theirs,
             )
         )
-    columns = ("set", "diagnosis, s", "held to, s", "found", "mujoco.sysid, s", "fitted")
+    options = "with training's options, s"
+    columns = ("set", "diagnosis, s", "held to, s", options, "found", "mujoco.sysid, s", "fitted")
     return table(columns, rows) + origin("hidden_effects_timing", result)
 
 

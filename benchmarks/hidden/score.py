@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -36,6 +37,8 @@ HELD_CLOSE = {
     ("sensor_delay", "delay"),
 }
 """Parameters that have to come within `CLOSE`: friction, gain, mass, delay."""
+PERIODIC = "cogging_torque.phase"
+"""An angle: whole turns more mean the same."""
 LARGEST_RATIO = 1.25
 """Held-out error after adding, over that of the true model at the nominal timestep."""
 
@@ -129,23 +132,28 @@ def score(found: Diagnosis, truth: Truth, model: mujoco.MjModel) -> dict[str, An
 
 
 def _estimates(candidate: Candidate, secret: Secret) -> list[dict[str, Any]]:
-    rows = []
-    for name, value in candidate.parameters.items():
-        if name in secret.parameters and np.isfinite(value.low):
-            true = secret[name]
-            rows.append(
-                {
-                    "parameter": f"{secret.kind}.{name}",
-                    "true": true,
-                    "estimate": value.estimate,
-                    "low": value.low,
-                    "high": value.high,
-                    "relative_error": abs(value.estimate - true) / max(abs(true), 1e-12),
-                    "covered": bool(value.low <= true <= value.high),
-                    "held_close": (secret.kind, name) in HELD_CLOSE,
-                }
-            )
-    return rows
+    return [
+        {
+            "parameter": f"{secret.kind}.{name}",
+            "true": secret[name],
+            "estimate": value.estimate,
+            "low": value.low,
+            "high": value.high,
+            "held_close": (secret.kind, name) in HELD_CLOSE,
+        }
+        for name, value in candidate.parameters.items()
+        if name in secret.parameters and np.isfinite(value.low)
+    ]
+
+
+def judge(estimate: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an estimate with its relative error and whether its interval covers the truth."""
+    true, found = estimate["true"], estimate["estimate"]
+    if estimate["parameter"] == PERIODIC:
+        true = found + math.remainder(true - found, 2 * math.pi)
+    error = abs(found - true) / max(abs(true), 1e-12)
+    covered = estimate["low"] <= true <= estimate["high"]
+    return {**estimate, "relative_error": error, "covered": covered, "close": error <= CLOSE}
 
 
 def true_error(
@@ -216,9 +224,7 @@ def aggregate(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         _share("clean, not called unexplained", clean, "explained", None),
         _share("outside, unexplained", of["outside"], "ok", 0.90),
     ]  # fmt: skip
-    estimates = [e | {"case": r["case"]} for r in done for e in r.get("estimates", [])]
-    for estimate in estimates:
-        estimate["close"] = estimate["relative_error"] <= CLOSE
+    estimates = [judge(e) | {"case": r["case"]} for r in done for e in r.get("estimates", [])]
     close = [e for e in estimates if e["held_close"]]
     lines += [
         _share("estimates of friction, gain, mass, delay within 5 %", close, "close", 0.95),

@@ -1,9 +1,12 @@
 """Time `garat diagnose` beside mujoco.sysid, which is told the model's only wrong parameter.
 
-Both read the same recordings and run as processes of their own, start-up included.
+Both read the same recordings and run as processes of their own, start-up included. In turns with
+the diagnosis runs one with the compiler options of training. Each finds an empty compilation cache.
 """
 
+import functools
 import json
+import os
 import statistics
 import subprocess
 import sys
@@ -16,10 +19,17 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from garat_jax.compiler_options import FUSION_EMITTERS, OPTIMISATION_LEVEL
+
 from .bodies import SECRETS
 from .generate import Case, Surveys, Truth, generate
 
 REPEATS = 3
+OPTIONS = {
+    "garat": "",
+    "garat_with_training_options": f"--{OPTIMISATION_LEVEL}=1 --{FUSION_EMITTERS}=true",
+}
+"""XLA_FLAGS of each diagnosis that is timed."""
 RATE = 250.0
 CASES = {
     "pendulum": ("coulomb_friction", "joint/hinge", {"torque": 0.06}, 8.0, 20.0),
@@ -43,15 +53,18 @@ def measure(robot: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         paths = generate(truth, scenes[robot], folder)
-        garat = _time(lambda: _diagnose(folder / f"{robot}.xml", paths, folder / "out"))
+        took = {name: [] for name in OPTIONS}
+        for _ in range(REPEATS):
+            for name, flags in OPTIONS.items():
+                took[name].append(_time(functools.partial(_diagnose, robot, paths, folder, flags)))
         found = json.loads((folder / "out" / "diagnosis.json").read_text())
         sysid, said = _time_sysid(robot, folder)
     row = {
         **truth.to_json(),
-        "garat_seconds": garat,
-        "garat_median": statistics.median(garat),
+        **{f"{name}_seconds": seconds for name, seconds in took.items()},
+        **{f"{name}_median": statistics.median(seconds) for name, seconds in took.items()},
         "limit": limit,
-        "met": statistics.median(garat) <= limit,
+        "met": statistics.median(took["garat"]) <= limit,
         "garat_found": [
             {k: c[k] for k in ("effect", "target", "parameters")} for c in found["selected"]
         ],
@@ -63,21 +76,22 @@ def measure(robot: str) -> dict[str, Any]:
     return row
 
 
-def _time(action: Callable[[], Any]) -> list[float]:
-    seconds = []
-    for _ in range(REPEATS):
-        started = time.monotonic()
-        action()
-        seconds.append(time.monotonic() - started)
-    return seconds
+def _time(action: Callable[[], Any]) -> float:
+    started = time.monotonic()
+    action()
+    return time.monotonic() - started
 
 
-def _diagnose(model: Path, paths: list[Path], out: Path) -> None:
+def _diagnose(robot: str, paths: list[Path], folder: Path, flags: str) -> None:
+    """Diagnose into `folder`/out, with XLA_FLAGS and an empty compilation cache."""
     holdout = ["--holdout", str(paths[-1])]
     data = [str(path) for path in paths[:-1]]
     garat = str(Path(sys.executable).with_name("garat"))
-    program = [garat, "diagnose", str(model), *data, *holdout]
-    subprocess.run([*program, "--out", str(out), "--force"], check=True, capture_output=True)
+    program = [garat, "diagnose", str(folder / f"{robot}.xml"), *data, *holdout]
+    program += ["--out", str(folder / "out"), "--force"]
+    with tempfile.TemporaryDirectory() as cache:
+        variables = os.environ | {"XLA_FLAGS": flags, "JAX_COMPILATION_CACHE_DIR": cache}
+        subprocess.run(program, check=True, capture_output=True, env=variables)
 
 
 def _time_sysid(robot: str, folder: Path) -> tuple[list[float], Any]:
@@ -91,7 +105,7 @@ def _time_sysid(robot: str, folder: Path) -> tuple[list[float], Any]:
         said.append(done.stdout.splitlines()[-1])
 
     try:
-        seconds = _time(run)
+        seconds = [_time(run) for _ in range(REPEATS)]
     except subprocess.CalledProcessError as error:
         return [], f"mujoco.sysid did not run: {error.stderr.strip().splitlines()[-1]}"
     return seconds, json.loads(said[-1])
