@@ -201,7 +201,9 @@ def target_steps(arguments: Arguments, name: str) -> int:
 
 
 def recorded(arguments: Arguments) -> tuple[Kept, Kept]:
-    """Return the rows of the result file, of worlds and of targets; not where `TIMES` changed.
+    """Return the rows of the result file, of worlds and of targets.
+
+    Not those of a target whose `TIMES`, or whose pair's trust region, changed.
 
     Raises:
         SystemExit: They have another number of steps.
@@ -212,7 +214,10 @@ def recorded(arguments: Arguments) -> tuple[Kept, Kept]:
     if sizes - {arguments.steps}:
         raise SystemExit(f"--extend: {path} has {sorted(sizes)} steps; give the same")
     targets = [
-        row for row in result["targets"] if row["steps"][-1] == target_steps(arguments, row["env"])
+        row
+        for row in result["targets"]
+        if row["steps"][-1] == target_steps(arguments, row["env"])
+        and row["max_kl"] == PAIRS[row["env"]].agent.max_kl
     ]
     return {_key(row): row for row in worlds}, {_key(row): row for row in targets}
 
@@ -252,8 +257,8 @@ def measure(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]]:
 
 def measure_targets(arguments: Arguments, kept: Kept) -> Iterator[dict[str, Any]]:
     """Yield a row for each pair's target."""
-    config = TRPOConfig()
     for name in arguments.pairs:
+        config = PAIRS[name].agent
         _, target = PAIRS[name].worlds("mujoco")
         solved, steps = target.env.task.solved_return, target_steps(arguments, name)
         row = kept.get((name, OURS, config.max_kl))

@@ -10,17 +10,17 @@ from garat_jax.transfer import GroundConfig, Pair, TransferConfig
 
 def garat(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferConfig:
     """GARAT with the settings that docs/grounding.md measures best."""
-    return TransferConfig(pair, "garat", seeds=seeds, engine=engine)
+    return TransferConfig(pair, "garat", seeds=seeds, engine=engine, agent=pair.agent)
 
 
 def garat_paper(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferConfig:
     """GARAT with the paper's numbers and some choices of ours; kept to show what that gives.
 
-    From the paper: the transformer's PPO, discount and trace, the discriminator's learning rate,
-    one step of it an update, no offset of the reward. Not in the paper: the transformer's initial
-    standard deviation, 1 as in the usual libraries. Ours: the L2 coefficient, the order of the two
-    updates, an output that is a change of the action, the discriminator's inputs, training in the
-    grounded source with the transformer's mean action.
+    From the paper: the agent's TRPO, the transformer's PPO, discount and trace, the discriminator's
+    learning rate, one step of it an update, no offset of the reward. Not in the paper: the
+    transformer's initial standard deviation, 1 as in the usual libraries. Ours: the L2 coefficient,
+    the order of the two updates, an output that is a change of the action, the discriminator's
+    inputs, training in the grounded source with the transformer's mean action.
     """
     settings = GARATConfig(
         transformer=PPOConfig(),  # Desai et al. 2020, appendix
@@ -34,7 +34,13 @@ def garat_paper(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferCon
 def gat(pair: Pair, seeds: int = 5, engine: str = "auto") -> TransferConfig:
     """GAT, the paper's baseline: a forward model of the target, an inverse one of the source."""
     return TransferConfig(
-        pair, "gat", seeds=seeds, engine=engine, grounding=GATConfig(), num_updates=20
+        pair,
+        "gat",
+        seeds=seeds,
+        engine=engine,
+        agent=pair.agent,
+        grounding=GATConfig(),
+        num_updates=20,
     )
 
 

@@ -44,6 +44,7 @@ class Pair:
         target: Overrides that make the target.
         source_effects: Physical effects that the source has.
         target_effects: Physical effects that the target has.
+        agent: Settings with which an agent learns either world.
         max_iterations: Of training a policy until it solves either world.
     """
 
@@ -54,6 +55,7 @@ class Pair:
     target: tuple[Override, ...]
     source_effects: tuple[Effect, ...] = ()
     target_effects: tuple[Effect, ...] = ()
+    agent: TRPOConfig = dataclasses.field(default_factory=TRPOConfig)
     max_iterations: int = 200
 
     def worlds(self, engine: str = "auto") -> tuple[World, World]:

@@ -144,6 +144,7 @@ def _targets(result: dict[str, Any]) -> str:
     lines = [
         (
             row["env"],
+            f"{row['max_kl']:g}",
             f"{row['steps'][-1]:,}",
             *(f"{sum(returns) / len(returns):,.4g}" for returns in row["returns"]),
             f"{row['solved_return']:,.4g}",
@@ -153,7 +154,7 @@ def _targets(result: dict[str, Any]) -> str:
     ]
     points = len(result["targets"][0]["steps"])
     parts = [f"after {100 * (k + 1) // points} %" for k in range(points)]
-    columns = ("target of", "steps", *parts, "solved from", "seeds that solve it")
+    columns = ("target of", "KL ≤", "steps", *parts, "solved from", "seeds that solve it")
     return table(columns, lines) + commits(result["targets"])
 
 
