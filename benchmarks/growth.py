@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import tyro
 from record import RESULTS, command_line, write_result
 from speed import ours
@@ -80,14 +79,12 @@ def main() -> None:
         by_seeds = [size_of(num_seeds, 50) for num_seeds in arguments.num_seeds]
         rows += grow(name, "envs", by_envs, arguments)
         rows += grow(name, "seeds", by_seeds, arguments)
-    backend = jax.default_backend()
     print(
         write_result(
-            "growth" if backend == "cpu" else f"growth_{backend}",
+            "growth",
             rows,
             seeds=list(range(max(arguments.num_seeds))),
             command=command_line(),
-            details={"device": jax.devices()[0].device_kind},
             folder=arguments.out,
         )
     )

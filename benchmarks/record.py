@@ -24,10 +24,10 @@ def write_result(
     details: Mapping[str, Any] | None = None,
     folder: Path = RESULTS,
 ) -> Path:
-    """Write one benchmark's rows to `results/<name>.json`.
+    """Write one benchmark's rows to `results/<name>.json`; on an accelerator `<name>_gpu.json`.
 
     Args:
-        name: The benchmark; the file is named after it.
+        name: The benchmark; the file is named after it, and after the device unless that is a CPU.
         rows: One mapping a row of the table or a point of the figure.
         seeds: The seeds that the rows come from.
         command: The command line that makes the rows again, from the root of the repository.
@@ -42,6 +42,11 @@ def write_result(
     """
     if not rows:
         raise ValueError(f"benchmark {name!r} has no rows; expected one or more")
+    import jax  # late: benchmarks set variables that JAX reads when it is imported
+
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        name = f"{name}_{device.platform}"
     result = {
         "format": FORMAT,
         "name": name,
@@ -49,6 +54,7 @@ def write_result(
         "seeds": list(seeds),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         **provenance(),
+        "device": device.device_kind,
         **(details or {}),
         "rows": rows,
     }

@@ -22,6 +22,7 @@ from garat_jax.engine import HostModel
 from garat_jax.errors import UserError, unknown_name
 from garat_jax.mjx_model import put_model, with_fields
 from garat_jax.overrides import Override
+from garat_jax.precision import full_precision
 from garat_jax.setconst import CONSTANT_INPUTS
 
 ENGINES = ("auto", "mjx", "mujoco")
@@ -112,12 +113,10 @@ def compile(
     return Dynamics(effects=as_arrays, model=model, host=host, engine=engine)
 
 
+@full_precision
 def view(dynamics: Dynamics) -> ModelView:
     """Return the model's native fields as the effects leave them."""
-    if dynamics.engine == "mjx":
-        root: Any = dynamics.model
-    else:
-        root = dynamics.host.model
+    root: Any = dynamics.model if dynamics.engine == "mjx" else dynamics.host.model
 
     def read(name: str) -> jax.Array:
         owner, _, field = name.rpartition(".")
@@ -331,6 +330,7 @@ def note(dynamics: Dynamics, state: PhysicsState, seconds: float) -> PhysicsStat
     return state._replace(memory=tuple(memories))
 
 
+@full_precision
 def _act(dynamics: Dynamics, model: ModelView, state, ctrl, memories):
     """Apply every effect once: model, command [nu], generalised force [nv], memories."""
     force = jnp.zeros(dynamics.host.model.nv, ctrl.dtype)
@@ -375,6 +375,7 @@ def _tuned(dynamics: Dynamics, constants: Any, model: ModelView, tuned: ModelVie
     return constants.replace(**fields)
 
 
+@full_precision
 def _advance(
     dynamics: Dynamics,
     constants: Any,
@@ -394,6 +395,5 @@ def _advance(
         after = mjx.step(constants, data.replace(**before, ctrl=ctrl, qfrc_applied=force))
         return state._replace(**{name: getattr(after, name) for name in stepped}), None
 
-    repeat = (num_substeps, 1)
-    inputs = tuple(jnp.tile(x, repeat) if x.shape[0] == 1 else x for x in (commands, forces))
+    inputs = [jnp.broadcast_to(x, (num_substeps, x.shape[1])) for x in (commands, forces)]
     return jax.lax.scan(substep, state, inputs)[0]

@@ -8,6 +8,7 @@ import numpy as np
 
 from garat_jax._mjx import mjx
 from garat_jax.errors import UserError
+from garat_jax.precision import full_precision
 from garat_jax.setconst import CONSTANT_INPUTS, set_const
 
 HINT = "use engine mujoco, which JAX_PLATFORMS=cpu chooses"
@@ -35,6 +36,7 @@ def put_model(model: mujoco.MjModel) -> mjx.Model:
         raise UserError(f"engine mjx cannot step this model: {error}; use mujoco") from error
 
 
+@full_precision
 def with_fields(
     model: mjx.Model, host: mujoco.MjModel, changed: Mapping[str, jax.Array]
 ) -> mjx.Model:

@@ -1,6 +1,8 @@
 import json
 import math
+from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
@@ -15,8 +17,16 @@ def test_a_result_names_what_is_needed_to_get_it_again(tmp_path):
     assert result["rows"] == [{"env": "x", "rate": 2.0}]
     assert result["seeds"] == [0, 1]
     assert result["command"] == "python x.py"
-    assert {"git", "versions", "machine", "date"} <= result.keys()
+    assert {"git", "versions", "machine", "device", "date"} <= result.keys()
     assert {"cpu", "cores", "memory_gib"} <= result["machine"].keys()
+
+
+def test_a_result_of_an_accelerator_is_named_after_it(tmp_path, monkeypatch):
+    gpu = SimpleNamespace(platform="gpu", device_kind="NVIDIA H100")
+    monkeypatch.setattr(jax, "devices", lambda: [gpu])
+    path = write_result("speed", [{}], seeds=[0], command="python x.py", folder=tmp_path)
+    assert path == tmp_path / "speed_gpu.json"
+    assert json.loads(path.read_text())["device"] == "NVIDIA H100"
 
 
 @pytest.mark.parametrize("rows", [[], [{"rate": math.nan}]])

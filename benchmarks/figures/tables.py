@@ -236,6 +236,7 @@ def fidelity() -> str:
     if not paths:
         return "Not measured yet: `python benchmarks/fidelity.py`.\n"
     results = [read(path.stem) for path in paths]
+    results = [result for result in results if result.get("device", "cpu") == "cpu"]
     lines = []
     for result in results:
         rows: dict[tuple[str, int, int], dict[str, Any]] = {}

@@ -1,0 +1,26 @@
+import jax
+import jax.numpy as jnp
+
+from garat_jax import dynamics
+from garat_jax.effects import AirDrag, PayloadMass
+from tests.models import PENDULUM, spec
+
+
+def test_physics_and_its_derivatives_use_all_bits_where_a_device_would_drop_some():
+    effects = (
+        PayloadMass(target="body/pole", mass=0.1),
+        AirDrag(target="body/pole", coefficient=0.1),
+    )
+    world = dynamics.compile(spec(PENDULUM), (), effects, "mjx")
+    host = world.host.model
+
+    def reached(effects, ctrl):
+        at = world.replace(effects=effects)
+        state = dynamics.initial_state(at, jnp.asarray(host.qpos0), jnp.zeros(host.nv))
+        return dynamics.step(at, state, ctrl).qvel.sum()
+
+    for function in (reached, jax.jacfwd(reached)):
+        program = jax.jit(function).lower(world.effects, jnp.zeros(host.nu)).as_text()
+        products = [line for line in program.splitlines() if "stablehlo.dot_general" in line]
+        assert products
+        assert all("precision = [HIGHEST, HIGHEST]" in line for line in products)
