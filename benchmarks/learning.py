@@ -85,10 +85,8 @@ def host_world(name: str) -> World:
 
 def configs(world: World, regions: Sequence[Region]) -> list[TRPOConfig]:
     """Return settings with the paper's trust region, and with as wide a one as the peer's mean."""
-    paper, num_actions = TRPOConfig(), world.env.action_size
-    wide = dataclasses.replace(
-        paper, max_kl=num_actions * paper.max_kl, cg_damping=num_actions * paper.cg_damping
-    )
+    paper = TRPOConfig()
+    wide = paper.averaged(world.env.action_size)
     by_region: dict[Region, TRPOConfig] = {"sum": paper, "mean": wide}
     return list(dict.fromkeys(by_region[region] for region in regions))
 

@@ -193,10 +193,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return complain(f"error: {error}", FAILED)
     except UserError as error:
         return complain(f"error: {error}", USER_ERROR)
-    except RuntimeError as error:  # a device that is not there shows wherever JAX starts
-        from garat_jax.devices import NOT_THERE, describe
+    except (AssertionError, RuntimeError) as error:
+        from garat_jax.devices import describe, is_of_devices
 
-        if not str(error).startswith(NOT_THERE):
+        if not is_of_devices(error):
             raise
         return complain(f"error: {describe(error)}", USER_ERROR)
     return DONE

@@ -3,14 +3,12 @@
 import os
 import resource
 import sys
+import traceback
 from typing import Any
 
 import jax
 
 from garat_jax.errors import UserError
-
-NOT_THERE = "Unable to initialize backend"
-"""How JAX begins to say that there is no such device."""
 
 
 def num_cores() -> int:
@@ -96,6 +94,13 @@ def join_processes(
 def _or_variable(number: int | None, variable: str) -> int | None:
     text = os.environ.get(variable)
     return int(text) if number is None and text else number
+
+
+def is_of_devices(error: AssertionError | RuntimeError) -> bool:
+    """Say whether JAX raised an error because a device is not there, wherever it was started."""
+    if isinstance(error, AssertionError):  # CUDA's plugin is not there; it has no message
+        return traceback.extract_tb(error.__traceback__)[-1].filename.endswith("xla_bridge.py")
+    return str(error).startswith("Unable to initialize backend")
 
 
 def describe(error: Exception) -> UserError:

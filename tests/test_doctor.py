@@ -1,5 +1,9 @@
 """What `garat doctor` finds, measures and advises."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import pytest
 
@@ -111,10 +115,28 @@ def test_where_no_backend_of_a_gpu_is_installed_the_line_says_what_to_install(
     assert "rocm" not in line
 
 
-def test_a_device_that_only_shows_later_is_one_line_too(monkeypatch, capsys):
+@pytest.mark.parametrize("platform", ["cuda", "tpu"])
+def test_a_device_that_only_shows_later_is_one_line_too(platform):
+    program = (
+        "import jax, sys; from garat_jax import cli\n"
+        "cli.List.run = lambda self: jax.devices()\n"
+        "sys.exit(cli.main(['list']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program],
+        env=os.environ | {"JAX_PLATFORMS": platform},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("garat: error: JAX finds no device")
+    assert done.stderr.count("\n") == 1
+
+
+def test_an_error_that_is_not_of_devices_stays_one(monkeypatch):
     def fail(self):
-        raise RuntimeError("Unable to initialize backend 'tpu': no libtpu")
+        raise AssertionError
 
     monkeypatch.setattr(cli.List, "run", fail)
-    assert cli.main(["list"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    with pytest.raises(AssertionError):
+        cli.main(["list"])

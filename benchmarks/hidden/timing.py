@@ -50,8 +50,8 @@ def measure(robot: str) -> dict[str, Any]:
     case = Case(f"timing-{robot}", "single", (kind,), "medium", (0, 0))
     secret = SECRETS[kind](target, parameters)
     truth = Truth(case, robot, (secret,), RATE, seconds, "white", 0.0, ())
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
         paths = generate(truth, scenes[robot], folder)
         took = {name: [] for name in OPTIONS}
         for _ in range(REPEATS):

@@ -37,6 +37,16 @@ class TRPOConfig:
     value_epochs: int = static(5)
     value_minibatch: int = static(128)  # stable-baselines TRPO
 
+    def averaged(self, num_actions: int) -> "TRPOConfig":
+        """Return it with its trust region's limit on the mean over the action's components.
+
+        The paper limits their sum. sb3-contrib's TRPO averages the KL divergence, and with it its
+        Hessian, to which the damping is added.
+        """
+        return dataclasses.replace(
+            self, max_kl=num_actions * self.max_kl, cg_damping=num_actions * self.cg_damping
+        )
+
 
 def make(env: Env, config: TRPOConfig) -> Agent:
     """Build a TRPO agent for an environment.

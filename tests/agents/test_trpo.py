@@ -1,5 +1,6 @@
 """Natural gradient, trust region and line search against closed forms."""
 
+import dataclasses
 import functools
 
 import jax
@@ -153,3 +154,13 @@ def test_line_search_takes_the_longest_good_step(longest, fraction):
     found, taken = trpo.line_search(jnp.zeros(1), jnp.ones(1), evaluate, CONFIG)
     assert taken == fraction
     np.testing.assert_array_equal(found, [fraction])
+
+
+def test_a_limit_on_the_mean_of_the_components_allows_their_number_of_times_as_much():
+    weights, batch = weights_and_batch()
+    summed = TRPOConfig(max_kl=1e-5)
+    averaged = summed.averaged(NETWORK.size)
+    assert averaged.cg_damping == pytest.approx(NETWORK.size * summed.cg_damping)
+    undamped = (dataclasses.replace(config, cg_damping=0.0) for config in (summed, averaged))
+    one, two = (float(policy_step(weights, batch, config=c)[1]["kl"]) for c in undamped)
+    assert two == pytest.approx(NETWORK.size * one, rel=0.05)
