@@ -70,11 +70,22 @@ def _step(env: Env, params: Params, policy: Policy, policy_params: Params, state
     Returns:
         The next states, the transitions, and the true next states.
     """
-    num_envs = state.steps.shape[0] * shares
-    keys = jax.random.split(key, (3, num_envs))
-    act_keys, step_keys, reset_keys = split.own_share(keys, shares, axis=1)
+    *keys, reset_keys = _keys(state, key, shares)
+    reached, transition, after = _act(env, params, policy, policy_params, state, *keys)
+    fresh = jax.vmap(env.reset, (None, 0))(params, reset_keys)
+    return _select(transition.terminated | transition.truncated, fresh, reached), transition, after
+
+
+def _keys(state: EnvState, key: jax.Array, shares: int) -> jax.Array:
+    """Return keys to act, to step and to reset with, [3, B]."""
+    keys = jax.random.split(key, (3, state.steps.shape[0] * shares))
+    return split.own_share(keys, shares, axis=1)
+
+
+def _act(env: Env, params: Params, policy: Policy, policy_params: Params, state, act_keys, keys):
+    """Step a batch [B]; return as `_step`, but what has ended stays where it is."""
     action, log_prob = jax.vmap(policy, (None, 0, 0))(policy_params, state.obs, act_keys)
-    result, faulty, after = _guarded_steps(env, params, state, action, step_keys)
+    result, faulty, after = _guarded_steps(env, params, state, action, keys)
     transition = Transition(
         obs=state.obs,
         action=action,
@@ -85,9 +96,7 @@ def _step(env: Env, params: Params, policy: Policy, policy_params: Params, state
         log_prob=log_prob,
         faulty=faulty,
     )
-    fresh = jax.vmap(env.reset, (None, 0))(params, reset_keys)
-    done = result.terminated | result.truncated
-    return _select(done, fresh, result.state), transition, after
+    return result.state, transition, after
 
 
 def _guarded_steps(env: Env, params: Params, states: EnvState, actions: jax.Array, keys: jax.Array):
@@ -227,10 +236,10 @@ def evaluate(
 
     def step(carry):
         length, _, state, alive, total, num_steps, num_faults = carry
-        key = keys[length]
+        act_keys, step_keys, _ = _keys(state, keys[length], shares)
         idle = jax.vmap(env.idle, (None, 0))(params, state)
         state = _select(alive, state, idle)
-        state, transition, _ = _step(env, params, policy, policy_params, state, key, shares)
+        state, transition, _ = _act(env, params, policy, policy_params, state, act_keys, step_keys)
         total = total + alive * transition.reward
         num_steps, num_faults = num_steps + alive, num_faults + (alive & transition.faulty)
         alive = alive & ~(transition.terminated | transition.truncated)
