@@ -8,7 +8,7 @@ and that of the peer's user who gives it the paper's number, which it takes for 
 actions' components and not their sum. Ours also learns in the targets of the pairs, which it should
 solve, for longer where a million steps are not enough. `--extend` keeps the rows of the result file
 and adds what they lack, seeds too; each names the commits of its seeds. Where five seeds leave open
-who learns more, `--extend --seeds 20 --envs half_cheetah --regions sum --pairs` takes twenty there.
+who learns more, `--extend --seeds 40 --envs half_cheetah --regions sum --pairs` takes forty there.
 """
 
 # pyright: reportMissingImports=false
