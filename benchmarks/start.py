@@ -6,7 +6,6 @@ compilation cache and then with what that start left in it, and is stopped at it
 
 import dataclasses
 import os
-import signal
 import statistics
 import subprocess
 import sys
@@ -50,7 +49,7 @@ def seconds_to_first_update(engine: str, cache: Path, out: Path) -> float:
             raise RuntimeError(f"garat {' '.join(command)} did not get to its first update")
         time.sleep(0.01)
     seconds = time.perf_counter() - started
-    process.send_signal(signal.SIGINT)
+    process.kill()  # not Ctrl-C, which is ignored where a shell started this in the background
     process.wait()
     return seconds
 
