@@ -181,7 +181,6 @@ def true_error(
     segments = cut(everything, grid, float(stated[1]))
     problem = Problem(
         Simulator(true, (), grid),
-        Simulator(true, (), grid, refine=2),
         segments,
         segments.recording < len(fitted),
         grid.interval * grid.per_sample,

@@ -175,12 +175,10 @@ def size(
         raise UserError("every parameter is set, so nothing is left to fit; leave one of them out")
     horizon, segments = choose_horizon(simulator, recordings, grid)
     say(say_horizon(recordings, horizon))
-    finer = Simulator(model, (effect,), grid, refine=2)
-    for warning in warn_of_divergence(simulator, finer, recordings, grid, horizon):
+    for warning in warn_of_divergence(simulator, recordings, grid, horizon):
         say(f"warning: {warning}")
     problem = Problem(
         simulator,
-        finer,
         segments,
         np.ones(len(segments.start), bool),
         grid.interval * grid.per_sample,

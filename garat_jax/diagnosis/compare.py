@@ -169,14 +169,13 @@ def compare(
     say("choosing the horizon")
     stated, segments = choose_horizon(simulator, recordings, grid)
     say(say_horizon(recordings, stated))
-    finer = Simulator(model, (), grid, 2)
-    warnings = warn_of_divergence(simulator, finer, recordings, grid, stated)
+    warnings = warn_of_divergence(simulator, recordings, grid, stated)
     warnings += (STILL,) if is_still(segments) else ()
     played = {}
     for horizon in sorted({stated, *lasting_horizons(recordings)}):
         say(f"predicting over {horizon:g} s")
         played[horizon] = replay_with(simulator, recordings, grid, horizon)
-    error = _errors(played[stated], simulator, finer, grid)
+    error = _errors(played[stated], simulator, grid)
     alternatives = []
     for other in also:
         say(f"predicting with {other.path}")
@@ -251,10 +250,10 @@ def _at_horizons(played: Mapping[float, Replay]) -> tuple[AtHorizon, ...]:
     )
 
 
-def _errors(played: Replay, simulator: Simulator, finer: Simulator, grid: Grid) -> Errors:
+def _errors(played: Replay, simulator: Simulator, grid: Grid) -> Errors:
     segments = played.segments
     nothing = np.zeros(len(segments.start), bool)
-    problem = Problem(simulator, finer, segments, nothing, grid.interval * grid.per_sample)
+    problem = Problem(simulator, segments, nothing, grid.interval * grid.per_sample)
     metric = make_metric(problem)
     floor = noise_floor(problem, metric, settle(problem, simulator.base, segments.start))
     by_noise = dict(zip(played.sizes(), floor.rms.tolist(), strict=True))

@@ -146,7 +146,7 @@ class JointSimulator:
             selected: The effects of each condition, the shared ones first.
             condition: Which condition each recording was made in.
         """
-        self._simulator, self._condition = simulator, condition
+        self._simulator, self._selected, self._condition = simulator, selected, condition
         self.effects = tuple(effect for own in selected for effect in own)
         index = {(e.kind, e.target): i for i, e in enumerate(simulator.effects)}
         owners = [number for number, own in enumerate(selected) for _ in own]
@@ -164,6 +164,11 @@ class JointSimulator:
     def host(self) -> mujoco.MjModel:
         """The compiled MuJoCo model."""
         return self._simulator.host
+
+    def refined(self, factor: int) -> "JointSimulator":
+        """Return the same with `factor` physics substeps in place of each."""
+        finer = self._simulator.refined(factor)
+        return JointSimulator(finer, self._selected, self._condition)
 
     def predict(self, theta: np.ndarray, start: np.ndarray, segments: Segments) -> np.ndarray:
         """Predict every segment's signals under its own condition; see `Simulator.predict`."""
@@ -197,13 +202,10 @@ def _fit_together(
     host = native_model(model.compile(engine="mujoco"))
     grid = choose_grid(everything, host.opt.timestep)
     unmoved = [type(e)(target=e.target, **e.at(host, e.target)) for e in kinds.values()]
-    joint, finer = (
-        JointSimulator(Simulator(model, unmoved, grid, refine), selected, condition)
-        for refine in (1, 2)
-    )
+    joint = JointSimulator(Simulator(model, unmoved, grid), selected, condition)
     _, segments = choose_horizon(joint, everything, grid)
     fitted = np.ones(len(segments.start), bool)
-    problem = Problem(joint, finer, segments, fitted, grid.interval * grid.per_sample)
+    problem = Problem(joint, segments, fitted, grid.interval * grid.per_sample)
     start = segments.start
     if longer := cut_longer(problem, everything, grid, joint.base):
         problem, start = longer[0], longer[1].start

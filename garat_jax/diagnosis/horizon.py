@@ -56,7 +56,6 @@ def choose_horizon(
 
 def warn_of_divergence(
     simulator: Predictor,
-    finer: Predictor,
     recordings: Sequence[Recording],
     grid: Grid,
     horizon: float,
@@ -65,7 +64,6 @@ def warn_of_divergence(
 
     Args:
         simulator: The model.
-        finer: The same with half the physics timestep.
         recordings: What was measured.
         grid: The simulated steps.
         horizon: What `choose_horizon` chose.
@@ -76,7 +74,8 @@ def warn_of_divergence(
     longest = _possible(recordings)[0]
     segments = cut(recordings, grid, longest)
     predicted, halved = (
-        s.predict(s.base[None], segments.start[None], segments)[0] for s in (simulator, finer)
+        s.predict(s.base[None], segments.start[None], segments)[0]
+        for s in (simulator, simulator.refined(2))
     )
     diverges, samples = _gone(predicted, halved, segments)
     if not np.any(diverges):

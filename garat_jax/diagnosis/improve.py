@@ -160,10 +160,10 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     everything = thin((*fitted, *held_out))
     grid = choose_grid(everything, model.compile(engine="mujoco").host.model.opt.timestep)
     effects = nominal_effects(model, added)
-    simulator, finer = (Simulator(model, effects, grid, refine) for refine in (1, 2))
+    simulator = Simulator(model, effects, grid)
     _, segments = choose_horizon(simulator, everything, grid)
     seen = segments.recording < len(fitted)
-    problem = Problem(simulator, finer, segments, seen, grid.interval * grid.per_sample)
+    problem = Problem(simulator, segments, seen, grid.interval * grid.per_sample)
     final = found_theta(simulator, added)
     if longer := cut_longer(problem, everything, grid, final):
         problem, _ = longer

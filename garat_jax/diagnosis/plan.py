@@ -287,7 +287,7 @@ class _Judge:
         simulator = self._simulator
         segments = cut([self._recording(path, ctrl)], self._grid, HORIZON)
         everywhere = np.ones(len(segments.start), bool)
-        problem = Problem(simulator, simulator, segments, everywhere, 1.0 / RATE)
+        problem = Problem(simulator, segments, everywhere, 1.0 / RATE)
         lin = linearise(problem, simulator.base, segments.start, (), ())
         changes = self._changes(problem, segments.start, lin.residual)
         first, second = StartSpace(lin.start).remove(changes).reshape(-1, 2).T

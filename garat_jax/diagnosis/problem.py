@@ -7,7 +7,7 @@ batched simulation.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
 import mujoco
 import numpy as np
@@ -49,6 +49,10 @@ class Predictor(Protocol):
         """The compiled model."""
         ...
 
+    def refined(self, factor: int) -> Self:
+        """Return the same with `factor` physics substeps in place of each."""
+        ...
+
     def predict(self, theta: np.ndarray, start: np.ndarray, segments: Segments) -> np.ndarray:
         """Predict every segment's signals, [P, S, L, num_signals].
 
@@ -69,7 +73,6 @@ class Problem(Generic[AnySimulator]):
 
     Attributes:
         simulator: The model with all candidates.
-        finer: The same with half the physics timestep.
         segments: All segments, those held out among them.
         fitted: Which segments the parameters may see, [S] bool.
         interval: Seconds between samples.
@@ -77,7 +80,6 @@ class Problem(Generic[AnySimulator]):
     """
 
     simulator: AnySimulator
-    finer: AnySimulator
     segments: Segments
     fitted: np.ndarray
     interval: float
@@ -166,7 +168,7 @@ class Problem(Generic[AnySimulator]):
 
         A first-order integrator's error is twice this change.
         """
-        return self.residual_by(self.finer, theta, start) - residual
+        return self.residual_by(self.simulator.refined(2), theta, start) - residual
 
     def blocks(self) -> np.ndarray:
         """Return each whitened residual's block within its segment, [N]."""

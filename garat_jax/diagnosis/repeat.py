@@ -117,12 +117,11 @@ def _alone(
     grid = choose_grid(everything, host.opt.timestep)
     effects = (*nominal_effects(model, selected), *_rivals(model, selected, candidates))
     simulator = Simulator(model, effects, grid)
-    finer = Simulator(model, effects, grid, refine=2)
     theta = found_theta(simulator, selected)
     _, segments = choose_horizon(simulator, everything, grid)
     sample = grid.interval * grid.per_sample
     everywhere = np.ones(len(segments.start), bool)
-    whole = Problem(simulator, finer, segments, everywhere, sample)
+    whole = Problem(simulator, segments, everywhere, sample)
     free = {
         j: _Parameter(selected[slot.effect].named, slot.parameter.name, estimate.unit)
         for j, slot in enumerate(simulator.slots)

@@ -149,7 +149,7 @@ def replay_with(
     segments = segments.take(np.isin(segments.recording, shown))
     sample = grid.interval * grid.per_sample
     everywhere = np.ones(len(segments.start), bool)
-    problem = Problem(simulator, simulator, segments, everywhere, sample)
+    problem = Problem(simulator, segments, everywhere, sample)
     settled = settle(problem, simulator.base, segments.start)
     residual = settled.residual.reshape(segments.measured.shape)
     of_state = signals(simulator.host)[: segments.measured.shape[2]]

@@ -104,6 +104,8 @@ class Simulator:
             effect.unlock(spec)
         overrides = (*model.overrides, timestep)
         self._model = dataclasses.replace(model, spec=spec, overrides=overrides)
+        made = functools.partial(Simulator, model, candidates, grid, acting=acting)
+        self._refined = functools.cache(lambda factor: made(refine * factor))
         self.effects = tuple(candidates)
         self._alone = self._compile(())
         self._substeps = grid.substeps * refine
@@ -131,6 +133,10 @@ class Simulator:
     def host(self):
         """The compiled MuJoCo model, without candidates."""
         return self._alone.host.model
+
+    def refined(self, factor: int) -> "Simulator":
+        """Return the same with `factor` physics substeps in place of each, compiled once."""
+        return self._refined(factor)
 
     def _compile(self, chosen: tuple[int, ...]) -> dynamics.Dynamics:
         """Return the model's own effects on the model as it is compiled for some candidates.

@@ -4,11 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from garat_jax.diagnosis.differences import STEP, clear_differences, projected
+from garat_jax.diagnosis.differences import STEP, Differences, clear_differences, projected
 from garat_jax.diagnosis.fit import WIDE, converge, fit, interval, uncertainty, wide
+from garat_jax.diagnosis.metric import timestep_error, trusted
 from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels
 from garat_jax.diagnosis.robust import regress
-from garat_jax.diagnosis.starts import KEPT_PROMISE, Fit, follow, start_step
+from garat_jax.diagnosis.starts import KEPT_PROMISE, Fit, follow, settle_twice, start_step
 from garat_jax.diagnosis.surface import smooth_minimum
 
 EXTRAPOLATED = 0.1
@@ -20,54 +21,195 @@ UNFELT = 0.1
 EXPLAINED = 1.1
 """What would be left at a timestep of 0, relative to what the fit leaves, up to which that can be
 extrapolated."""
+REFINED = 4
+"""Physics substeps in place of each, from one timestep at which is fitted to the next."""
+REFINEMENTS = 2
+"""Largest number of finer timesteps at which is fitted."""
 REFITTED = 24
-"""Segments that are fitted again at least, at both timesteps."""
+"""Segments that are fitted again, at least."""
+IN_A_ROW = 4
+"""Of these, those that follow each other: one says where the next begins."""
+LOST = 10.0
+"""Cost of a segment, relative to noise's and to the median segment's, above which its initial state
+was not found."""
+SETTLED = 0.4
+"""What a finer timestep changes, in widths of the interval, below which no still finer one is
+tried: a timestep of 0 changes a third of that."""
 
 
 def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     """Move the estimates to where a timestep of 0 would have them, and the intervals with them.
 
     At the model's own timestep a parameter also makes up for the integrator's error, which may be
-    many times the noise. Where halving the timestep does much less or more than sensitivities
-    promise, or a timestep of 0 would explain less than the fit does, as across contacts, estimates
-    stay, fits at both timesteps say how far they are from those at 0, and their intervals reach as
-    far. Where contacts make the cost rough, that of a smooth surface counts; see `smooth_minimum`.
+    many times the noise. What half the timestep does is extrapolated, unless it does much less or
+    more than sensitivities promise, or a timestep of 0 would explain less than the fit does, as
+    across contacts. Where the timestep's error is above the noise, estimates are then those of fits
+    at finer timesteps. Where it is below, they stay, fits at the whole and at half the timestep say
+    how far they are from those at 0, and their intervals reach as far. Where contacts make the cost
+    rough, that of a smooth surface counts; see `smooth_minimum`.
     """
-    keep = np.asarray([j not in fitted.frozen for j in fitted.free], bool)
-    if not np.any(keep):
+    if not np.any(_excited(fitted)):
         return fitted
-    free = fitted.free
-    differences = clear_differences(problem, fitted.theta, fitted.start, free)
-    lin = differences.linearisation
-    if np.all(differences.is_clear[keep] & (differences.relative[keep] <= STEP)):
+    differences = clear_differences(problem, fitted.theta, fitted.start, fitted.free)
+    are_smooth = _are_smooth(differences, _excited(fitted))
+    if not are_smooth and _is_coarse(problem, fitted):
+        return _at_finer_timesteps(problem, fitted)
+    if are_smooth:
         fitted, lin = converge(problem, fitted, differences)
-    elif not np.all(differences.is_clear[keep]):
-        lin = wide(
-            problem, fitted, free, np.where(differences.is_clear, differences.relative, WIDE)
-        )
-    rough = np.zeros(len(free))
-    if np.any(differences.relative[keep] > STEP):
-        covariance, sure = uncertainty(problem, lin, keep)
-        excited = np.asarray(free)[keep]
-        fitted, rough[keep] = smooth_minimum(problem, fitted, excited, covariance, sure)
-        lin = lin._replace(residual=fitted.residual)
-    theta, start = fitted.theta, fitted.start
+        rough = np.zeros(len(fitted.free))
+    else:
+        fitted, lin, rough = _at_smooth_minimum(problem, fitted, differences)
+    if moved := _extrapolated(problem, fitted, lin, rough):
+        return moved
+    if _is_coarse(problem, fitted):
+        return _at_finer_timesteps(problem, fitted)
+    low, high = _interval(problem, fitted.theta, fitted, lin, rough)
+    shift = _shift_by_fits(problem, fitted)
+    low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
+    return dataclasses.replace(fitted, low=low, high=high)
+
+
+def _excited(fitted: Fit) -> np.ndarray:
+    """Say which of the free parameters the data excite, [k] bool."""
+    return np.asarray([j not in fitted.frozen for j in fitted.free], bool)
+
+
+def _are_smooth(differences: Differences, keep: np.ndarray) -> bool:
+    """Say whether none of the parameters that are kept makes predictions jump."""
+    return bool(np.all((differences.is_clear & (differences.relative <= STEP))[keep]))
+
+
+def _is_coarse(problem: Problem, fitted: Fit) -> bool:
+    """Say whether the timestep's error is above the noise."""
+    _, change = timestep_error(problem, fitted)
+    return bool(np.sum(change[problem.fitted] ** 2) > np.sum(problem.expected[problem.fitted]))
+
+
+def _at_smooth_minimum(
+    problem: Problem, fitted: Fit, differences: Differences
+) -> tuple[Fit, Linearisation, np.ndarray]:
+    """Move a fit to the minimum of a smooth surface through its cost.
+
+    Returns:
+        The fit there, the linearisation, and how far parameters may be from there, [k].
+    """
+    keep, lin = _excited(fitted), differences.linearisation
+    if not np.all(differences.is_clear[keep]):
+        relative = np.where(differences.is_clear, differences.relative, WIDE)
+        lin = wide(problem, fitted, fitted.free, relative)
+    covariance, sure = uncertainty(problem, lin, keep)
+    columns, rough = np.asarray(fitted.free)[keep], np.zeros(len(keep))
+    fitted, rough[keep] = smooth_minimum(problem, fitted, columns, covariance, sure)
+    return fitted, lin._replace(residual=fitted.residual), rough
+
+
+def _interval(problem: Problem, theta, fitted: Fit, lin: Linearisation, rough: np.ndarray):
+    """Return 95 % intervals' ends, with a further, independent half-width, [k] each."""
+    low, high = interval(problem, theta, lin, fitted.free, _excited(fitted))
+    known = np.isfinite(low) & np.isfinite(high)
+    centre = (low[known] + high[known]) / 2
+    half = np.hypot((high[known] - low[known]) / 2, rough[known])
+    low[known], high[known] = centre - half, centre + half
+    return low, high
+
+
+def _extrapolated(
+    problem: Problem, fitted: Fit, lin: Linearisation, rough: np.ndarray
+) -> Fit | None:
+    """Return a fit with what half the timestep does extrapolated; None if that cannot be trusted.
+
+    Args:
+        problem: What is fitted.
+        fitted: The fit, converged.
+        lin: The linearisation there.
+        rough: How far its free parameters may be from the minimum, [k].
+    """
+    theta, start, free, keep = fitted.theta, fitted.start, fitted.free, _excited(fitted)
     halved = problem.integrator_error(theta, start, fitted.residual)
     near = lin._replace(start=fitted.sensitivity)
     shift = _step(problem, near._replace(residual=2.0 * halved), theta, free, keep)
     kept = _kept_promise(problem, near._replace(residual=halved), fitted, 0.5 * shift)
-    there = None
-    if abs(1.0 - kept) <= 1.0 - KEPT_PROMISE:
-        there = _moved(problem, near._replace(residual=2.0 * halved), fitted, shift)
+    if abs(1.0 - kept) > 1.0 - KEPT_PROMISE:
+        return None
+    there = _moved(problem, near._replace(residual=2.0 * halved), fitted, shift)
     if there is None:
-        low, high = _wider(interval(problem, theta, lin, free, keep), rough)
-        shift = _shift_by_fits(problem, fitted)
-        low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
-        return dataclasses.replace(fitted, low=low, high=high)
+        return None
     moved, left = there
-    low, high = _wider(interval(problem, moved, lin._replace(residual=left), free, keep), rough)
+    low, high = _interval(problem, moved, fitted, lin._replace(residual=left), rough)
     unsure = max(EXTRAPOLATED, abs(1.0 - kept)) * np.abs((moved - theta)[list(free)])
     return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
+
+
+def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
+    """Return a fit as ever finer timesteps have it, until a timestep of 0 would hardly change it.
+
+    The integrator's error falls with the timestep. But contacts hold a fit back on its way: what
+    the last timestep changed may be to come once more, and counts as unsure. The noise is the same
+    at each, so that an interval that is narrower than at the timestep before is so by chance.
+    """
+    free = list(fitted.free)
+    chosen = _chosen(problem)
+    some, near = problem.take(chosen), fitted.take(chosen)
+    before, change = near, np.zeros(len(free))
+    for _ in range(REFINEMENTS):
+        some, before = _finer(some, near)
+        near = fit(some, before.theta, before.start, free, sensitivity=before.sensitivity)
+        differences = clear_differences(some, near.theta, near.start, free)
+        if _are_smooth(differences, _excited(near)):
+            near, _ = converge(some, near, differences)
+        change = (near.theta - before.theta)[free]
+        if np.all(np.abs(change) <= SETTLED * (near.high - near.low)):
+            break
+    half = np.maximum(near.high - near.low, before.high - before.low) / 2
+    is_told = np.isfinite(half)
+    half, change = half[is_told], change[is_told]
+    low, high, centre = fitted.low.copy(), fitted.high.copy(), near.theta[free][is_told]
+    low[is_told] = centre - half + np.minimum(change, 0.0)
+    high[is_told] = centre + half + np.maximum(change, 0.0)
+    return dataclasses.replace(follow(problem, near.theta, fitted), low=low, high=high)
+
+
+def _chosen(problem: Problem) -> np.ndarray:
+    """Return the indices of the segments that are fitted again, evenly chosen."""
+    fitted = np.flatnonzero(problem.fitted)
+    apart = max(1, len(fitted) // REFITTED)
+    return fitted[np.arange(len(fitted)) // IN_A_ROW % apart == 0]
+
+
+def _finer(problem: Problem, near: Fit) -> tuple[Problem, Fit]:
+    """Return a problem at a finer timestep and a fit's initial states settled there.
+
+    What a sample is trusted follows from the error at this timestep. Segments that stay far from
+    what was measured, when most do not, are left out: their initial states were not found, on the
+    wrong side of a contact.
+    """
+    everything = np.ones_like(problem.segments.trust)
+    segments = dataclasses.replace(problem.segments, trust=everything)
+    simulator = problem.simulator.refined(REFINED)
+    finer = dataclasses.replace(problem, simulator=simulator, segments=segments)
+    settled = settle_twice(finer, follow(finer, near.theta, near))
+    share = settled.cost / finer.expected
+    found = np.flatnonzero(share <= LOST * max(1.0, float(np.median(share))))
+    finer, settled = finer.take(found), settled.take(found)
+    return trusted(finer, settled), settled
+
+
+def _shift_by_fits(problem: Problem, near: Fit) -> np.ndarray:
+    """Return how far a timestep of 0 moves the free parameters, by fits at the whole and at half.
+
+    Some segments say it, evenly chosen.
+    """
+    chosen = _chosen(problem)
+    problem, near = problem.take(chosen), near.take(chosen)
+
+    def fitted_by(simulator) -> np.ndarray:
+        there = dataclasses.replace(problem, simulator=simulator)
+        return fit(there, near.theta, near.start, near.free, sensitivity=near.sensitivity).theta
+
+    simulator = problem.simulator
+    shift = 2.0 * (fitted_by(simulator.refined(2)) - fitted_by(simulator))
+    moved = problem.within_bounds(range(len(shift)), near.theta + shift)
+    return (moved - near.theta)[list(near.free)]
 
 
 def _step(problem: Problem, lin: Linearisation, theta: np.ndarray, free, keep) -> np.ndarray:
@@ -101,7 +243,7 @@ def _moved(problem: Problem, change: Linearisation, fitted: Fit, shift: np.ndarr
     expected, undamped = change.residual + change.parameters @ shift, np.zeros(len(fitted.start))
     apart = start_step(problem, change, expected, undamped, 0.0) * problem.segments.start_unit
     starts = fitted.start + apart
-    left = 2.0 * problem.residual_by(problem.finer, moved, starts)
+    left = 2.0 * problem.residual_by(problem.simulator.refined(2), moved, starts)
     left -= problem.residual_by(problem.simulator, moved, starts)
     after = projected(problem, change._replace(residual=left - fitted.residual))[1]
     explains_less = _cost(problem, left) > EXPLAINED * _cost(problem, fitted.residual)
@@ -112,34 +254,6 @@ def _moved(problem: Problem, change: Linearisation, fitted: Fit, shift: np.ndarr
 
 def _cost(problem: Problem, residual: np.ndarray) -> float:
     return float(np.sum(residual[problem.fitted] ** 2))
-
-
-def _shift_by_fits(problem: Problem, near: Fit) -> np.ndarray:
-    """Return how far a timestep of 0 moves the free parameters, by fits at the whole and at half.
-
-    Some segments say it, `REFITTED` or more, evenly chosen.
-    """
-    chosen = np.flatnonzero(problem.fitted)
-    chosen = chosen[:: max(1, len(chosen) // REFITTED)]
-    problem, near = problem.take(chosen), near.take(chosen)
-
-    def fitted_by(simulator) -> np.ndarray:
-        there = dataclasses.replace(problem, simulator=simulator)
-        return fit(there, near.theta, near.start, near.free, sensitivity=near.sensitivity).theta
-
-    shift = 2.0 * (fitted_by(problem.finer) - fitted_by(problem.simulator))
-    moved = problem.within_bounds(range(len(shift)), near.theta + shift)
-    return (moved - near.theta)[list(near.free)]
-
-
-def _wider(ends: tuple[np.ndarray, np.ndarray], rough: np.ndarray):
-    """Return an interval with a further, independent half-width, [k] each."""
-    low, high = (np.array(end) for end in ends)
-    known = np.isfinite(low) & np.isfinite(high)
-    centre = (low[known] + high[known]) / 2
-    half = np.hypot((high[known] - low[known]) / 2, rough[known])
-    low[known], high[known] = centre - half, centre + half
-    return low, high
 
 
 def _kept_promise(problem: Problem, half: Linearisation, fitted: Fit, shift) -> float:

@@ -75,7 +75,7 @@ def at_rest(still):
     simulator = Simulator(model, make_candidates(model), grid)
     segments = cut(recordings, grid, 0.5)
     everywhere = np.ones(len(segments.start), bool)
-    problem = Problem(simulator, simulator, segments, everywhere, grid.interval)
+    problem = Problem(simulator, segments, everywhere, grid.interval)
     return problem, settle(problem, simulator.base, segments.start)
 
 

@@ -61,8 +61,8 @@ def make_problem(recordings, candidates, horizon=0.4, model=MODEL, timestep=0.00
     grid = choose_grid(recordings, timestep)
     segments = cut(recordings, grid, horizon)
     fitted = np.ones(len(segments.start), bool)
-    coarse, finer = (Simulator(model, candidates, grid, refine) for refine in (1, 2))
-    return Problem(coarse, finer, segments, fitted, grid.interval * grid.per_sample)
+    simulator = Simulator(model, candidates, grid)
+    return Problem(simulator, segments, fitted, grid.interval * grid.per_sample)
 
 
 def candidates():

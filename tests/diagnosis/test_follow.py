@@ -23,7 +23,7 @@ def problem() -> Problem[Simulator]:
     grid = choose_grid(recordings, 0.002)
     simulator = Simulator(MODEL, EFFECTS, grid)
     segments = cut(recordings, grid, 0.5)
-    return Problem(simulator, simulator, segments, np.ones(len(segments.start), bool), 0.004)
+    return Problem(simulator, segments, np.ones(len(segments.start), bool), 0.004)
 
 
 def test_each_segment_may_have_parameters_of_its_own(problem):

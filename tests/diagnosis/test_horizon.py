@@ -40,7 +40,7 @@ def test_what_was_found_lets_a_model_be_followed_for_longer():
     grid = choose_grid(recordings, 0.002)
     simulator = Simulator(MODEL, (MotorGain("actuator/motor"),), grid)
     horizon, segments = choose_horizon(simulator, recordings, grid)
-    problem = Problem(simulator, simulator, segments, segments.recording < 3, 0.004)
+    problem = Problem(simulator, segments, segments.recording < 3, 0.004)
     assert problem.horizon == pytest.approx(horizon)
     assert cut_longer(problem, recordings, grid, simulator.base) is None
     found = cut_longer(problem, recordings, grid, np.asarray([GAIN]))
@@ -56,9 +56,9 @@ def test_what_was_found_lets_a_model_be_followed_for_longer():
 def test_a_gap_that_shows_in_long_segments_alone_is_measured_there():
     recordings = record_weak(0.0)
     grid = choose_grid(recordings, 0.002)
-    simulator, finer = (Simulator(MODEL, (MotorGain("actuator/motor"),), grid, r) for r in (1, 2))
+    simulator = Simulator(MODEL, (MotorGain("actuator/motor"),), grid)
     horizon, segments = choose_horizon(simulator, recordings, grid)
-    problem = Problem(simulator, finer, segments, segments.recording < 3, 0.004)
+    problem = Problem(simulator, segments, segments.recording < 3, 0.004)
 
     def errors(gain: float) -> Errors | None:
         theta = np.asarray([gain])
@@ -81,7 +81,7 @@ def test_segments_are_no_longer_than_the_recordings():
     grid = choose_grid(recordings, 0.002)
     simulator = Simulator(MODEL, (MotorGain("actuator/motor"),), grid)
     _, segments = choose_horizon(simulator, recordings, grid)
-    problem = Problem(simulator, simulator, segments, segments.recording < 3, 0.004)
+    problem = Problem(simulator, segments, segments.recording < 3, 0.004)
     found = cut_longer(problem, recordings, grid, np.asarray([GAIN]))
     assert found
     assert found[0].horizon == pytest.approx(1.0)

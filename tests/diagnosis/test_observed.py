@@ -34,7 +34,7 @@ def mixed(measured):
 def problem(recordings):
     grid = choose_grid(recordings, HOST.opt.timestep)
     segments = cut(recordings, grid, 0.5)
-    return Problem(None, None, segments, segments.recording == 0, grid.interval)  # pyright: ignore
+    return Problem(None, segments, segments.recording == 0, grid.interval)  # pyright: ignore
 
 
 def test_measured_velocities_count_beside_a_recording_without(measured, mixed):

@@ -52,9 +52,9 @@ def problem() -> Problem[Simulator]:
     damped = functools.partial(add_damping, size=DAMPED)
     recordings = [record(damped, seed, pull=0.1) for seed in range(2)]
     grid = choose_grid(recordings, 0.002)
-    coarse, finer = (Simulator(MODEL, EFFECTS, grid, refine) for refine in (1, 2))
-    _, segments = choose_horizon(coarse, recordings, grid)
-    return Problem(coarse, finer, segments, segments.recording == 0, 0.004)
+    simulator = Simulator(MODEL, EFFECTS, grid)
+    _, segments = choose_horizon(simulator, recordings, grid)
+    return Problem(simulator, segments, segments.recording == 0, 0.004)
 
 
 def fit_with(problem: Problem, *effects: int):
@@ -196,11 +196,11 @@ def test_a_law_goes_where_one_that_refines_it_can_do_what_both_do():
     ]
     effects = (ViscousDamping(AT), AsymmetricFriction(AT))
     grid = choose_grid(recordings, 0.002)
-    coarse, finer = (Simulator(MODEL, effects, grid, refine) for refine in (1, 2))
-    _, segments = choose_horizon(coarse, recordings, grid)
-    problem = Problem(coarse, finer, segments, np.ones(len(segments.start), bool), 0.004)
+    simulator = Simulator(MODEL, effects, grid)
+    _, segments = choose_horizon(simulator, recordings, grid)
+    problem = Problem(simulator, segments, np.ones(len(segments.start), bool), 0.004)
     steps, free = [], []
-    names = [slot.parameter.name for slot in coarse.slots]
+    names = [slot.parameter.name for slot in simulator.slots]
     for effect, name in enumerate(("coefficient", "coulomb_positive")):
         free.append(names.index(name))
         score = Score(effect, (free[-1],), (0.0,), {}, 0.5, 0.0, True, np.zeros(0))

@@ -19,8 +19,12 @@ class Jumping:
 
     def __init__(self, simulator, first: int, jump: float):
         self._simulator, self._first, self._jump = simulator, first, jump
+        self.predict = simulator.predict
 
-    def predict(self, theta, start, segments):
+    def refined(self, factor: int):
+        return SimpleNamespace(predict=self._jumped)
+
+    def _jumped(self, theta, start, segments):
         predicted = self._simulator.predict(theta, start, segments)
         predicted[:, :, self._first :] += self._jump
         return predicted
@@ -65,8 +69,8 @@ def test_samples_that_half_a_timestep_changes_count_less_and_are_reported_as_the
     settled = settle(problem, problem.simulator.base, problem.segments.start)
     same = trusted(problem, settled).segments.trust
     assert same.min() > 0.5
-    finer = Jumping(problem.simulator, 60, 1000.0)
-    doubted = trusted(dataclasses.replace(problem, finer=finer), settled)
+    jumping = Jumping(problem.simulator, 60, 1000.0)
+    doubted = trusted(dataclasses.replace(problem, simulator=jumping), settled)
     trust = doubted.segments.trust
     assert trust[:, 60:].max() < 0.01
     np.testing.assert_array_equal(trust[:, :60], 1.0)

@@ -158,7 +158,7 @@ def test_the_parameters_are_recovered(kind):
     segments = cut(recordings, grid, 0.5)
     simulator = Simulator(model, chosen, grid)
     everything = np.ones(len(segments.start), bool)
-    problem = Problem(simulator, simulator, segments, everything, grid.interval)
+    problem = Problem(simulator, segments, everything, grid.interval)
     names = [slot.parameter.name for slot in simulator.slots]
     free = [names.index(name) for name in case.truth]
     if case.mjcf is SLIDER:
