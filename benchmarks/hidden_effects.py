@@ -3,8 +3,8 @@
 Thresholds are tuned on seed 0; a seed whose sets nobody has looked at says what to expect of new
 data. Every seed has a result file of its own. Rows are appended to OUT/rows.jsonl as they come, so
 an interrupted run goes on. `--sample N` diagnoses the first N sets of a random order; the result
-says of how many, and a larger sample with `--extend` keeps what the result file has. A set that
-takes longer than `--limit` counts as wrong. A run of hand-picked cases writes no result.
+says of how many, and a larger sample with `--extend` keeps what the result file has, but for the sets of
+robots that are measured `--anew`; each row has its commit. A set that takes longer than `--limit` counts as wrong. A run of hand-picked cases writes no result.
 `--timing` needs `pip install 'mujoco[sysid]'`.
 """
 
@@ -197,6 +197,9 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
     parser.add_argument("--sample", type=int, metavar="N", help="the first N of a random order")
     parser.add_argument("--extend", action="store_true", help="keep the rows of the result file")
+    parser.add_argument(
+        "--anew", nargs="+", choices=list(ROBOTS), default=[], help="robots whose rows are not kept"
+    )
     parser.add_argument("--limit", type=int, default=0, metavar="SECONDS", help="of a set; 0: none")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder of rows.jsonl")
@@ -217,7 +220,8 @@ def main() -> None:
     earlier = recorded_rows(arguments.seed) if arguments.extend else {}
     if beyond := earlier.keys() - {case.name for case in cases}:
         parser.error(f"--extend would drop {len(beyond)} recorded sets; give a larger --sample")
-    rows = run(cases, arguments.robots, arguments.jobs, path, earlier, arguments.limit)
+    kept = {name: row for name, row in earlier.items() if row["robot"] not in arguments.anew}
+    rows = run(cases, arguments.robots, arguments.jobs, path, kept, arguments.limit)
     lines = report(rows)
     picked = arguments.only or arguments.robots != list(ROBOTS)
     if not picked and not any(row["status"] == score.NOT_YET for row in rows):
