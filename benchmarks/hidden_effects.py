@@ -3,9 +3,10 @@
 Thresholds are tuned on seed 0; a seed whose sets nobody has looked at says what to expect of new
 data. Every seed has a result file of its own. Rows are appended to OUT/rows.jsonl as they come, so
 an interrupted run goes on. `--sample N` diagnoses the first N sets of a random order; the result
-says of how many, and a larger sample with `--extend` keeps what the result file has, but for the sets of
-robots that are measured `--anew`; each row has its commit. A set that takes longer than `--limit` counts as wrong. A run of hand-picked cases writes no result.
-`--timing` needs `pip install 'mujoco[sysid]'`.
+says of how many. A larger sample with `--extend` keeps what the result file has, but for the sets
+of robots that are measured `--anew`; each row has its commit. A set that takes longer than
+`--limit` counts as wrong. A run of hand-picked cases writes no result. `--timing` needs
+`pip install 'mujoco[sysid]'`.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from hidden import score
 from hidden.generate import Case, Surveys, Truth, draw, generate, list_cases, shuffled
 from hidden.robots import ROBOTS
 from jobs import end_with_parent
-from record import RESULTS, command_line, write_result
+from record import command_line, result_path, write_result
 
 from garat_jax.diagnosis import diagnose, load_model
 from garat_jax.diagnosis.compare import read_recordings
@@ -115,7 +116,7 @@ def result_name(seed: int) -> str:
 
 def recorded_rows(seed: int) -> dict[str, dict[str, Any]]:
     """Return the rows of the result file that come from this seed, by case."""
-    path = RESULTS / f"{result_name(seed)}.json"
+    path = result_path(result_name(seed))
     if not path.exists():
         return {}
     rows = json.loads(path.read_text(encoding="utf-8"))["rows"]

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 from jobs import end_with_parent
-from record import RESULTS, command_line, write_result
+from record import RESULTS, command_line, result_path, write_result
 
 from garat_jax import rollout
 from garat_jax.agents import trpo
@@ -206,7 +206,7 @@ def recorded(arguments: Arguments) -> tuple[Kept, Kept]:
     Raises:
         SystemExit: They have another number of steps.
     """
-    path = arguments.out / f"{NAME}.json"
+    path = result_path(NAME, arguments.out)
     result = json.loads(path.read_text(encoding="utf-8"))
     worlds, sizes = result["rows"], {row["steps"][-1] for row in result["rows"]}
     if sizes - {arguments.steps}:

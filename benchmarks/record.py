@@ -24,10 +24,10 @@ def write_result(
     details: Mapping[str, Any] | None = None,
     folder: Path = RESULTS,
 ) -> Path:
-    """Write one benchmark's rows to `results/<name>.json`; on an accelerator `<name>_gpu.json`.
+    """Write one benchmark's rows; see `result_path` for where.
 
     Args:
-        name: The benchmark; the file is named after it, and after the device unless that is a CPU.
+        name: The benchmark.
         rows: One mapping a row of the table or a point of the figure.
         seeds: The seeds that the rows come from.
         command: The command line that makes the rows again, from the root of the repository.
@@ -42,27 +42,34 @@ def write_result(
     """
     if not rows:
         raise ValueError(f"benchmark {name!r} has no rows; expected one or more")
-    import jax  # late: benchmarks set variables that JAX reads when it is imported
-
-    device = jax.devices()[0]
-    if device.platform != "cpu":
-        name = f"{name}_{device.platform}"
+    path = result_path(name, folder)
     result = {
         "format": FORMAT,
-        "name": name,
+        "name": path.stem,
         "command": command,
         "seeds": list(seeds),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         **provenance(),
-        "device": device.device_kind,
+        "device": _device().device_kind,
         **(details or {}),
         "rows": rows,
     }
     text = json.dumps(to_plain(result), indent=2, allow_nan=False) + "\n"
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{name}.json"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def result_path(name: str, folder: Path = RESULTS) -> Path:
+    """Return a benchmark's result file: `<name>.json`, on an accelerator `<name>_gpu.json`."""
+    platform = _device().platform
+    return folder / f"{name if platform == 'cpu' else f'{name}_{platform}'}.json"
+
+
+def _device():
+    import jax  # late: benchmarks set variables that JAX reads when it is imported
+
+    return jax.devices()[0]
 
 
 def command_line() -> str:

@@ -233,10 +233,10 @@ def ground() -> str:
 def fidelity() -> str:
     """MuJoCo's defaults, the fastest settings faithful in both engines, and one iteration."""
     paths = sorted((ROOT / "benchmarks/results").glob("fidelity_*.json"))
-    if not paths:
-        return "Not measured yet: `python benchmarks/fidelity.py`.\n"
     results = [read(path.stem) for path in paths]
     results = [result for result in results if result.get("device", "cpu") == "cpu"]
+    if not results:
+        return "Not measured yet: `python benchmarks/fidelity.py`.\n"
     lines = []
     for result in results:
         rows: dict[tuple[str, int, int], dict[str, Any]] = {}
