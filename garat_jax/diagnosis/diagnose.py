@@ -8,7 +8,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from garat_jax.diagnosis.drift import find_drifts
-from garat_jax.diagnosis.held_out import are_explained, errors_of, longest_errors, warn_of_fitted
+from garat_jax.diagnosis.held_out import (
+    are_explained,
+    errors_of,
+    longest_errors,
+    warn_of_fitted,
+    warn_of_timestep,
+)
 from garat_jax.diagnosis.horizon import (
     choose_horizon,
     say_horizon,
@@ -83,6 +89,8 @@ def diagnose(
     warnings += few_segments(problem)
     warnings += warn_of_fitted(problem, outcome.before, host) if outcome.adequate else ()
     error = errors_of(problem, (outcome.before, outcome.after), outcome.floor, host, how)
+    if not error.is_too_coarse:
+        warnings += warn_of_timestep(problem, outcome.floor, host)
     longest = longest_errors(problem, outcome.after.theta, everything, grid, host, how)
     explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
     found = Diagnosis(

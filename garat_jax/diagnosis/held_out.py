@@ -23,6 +23,9 @@ from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle
 
+COARSE = 3.0
+"""Noise and the timestep's error, in standard deviations of noise, from which a warning says so."""
+
 
 def errors_of(
     problem: Problem,
@@ -101,6 +104,24 @@ def longest_errors(
     floor = noise_floor(longer, make_metric(longer), after)
     errors = errors_of(longer, (before, after), floor, host, how, signals_mostly_above)
     return None if errors.is_too_coarse else errors
+
+
+def warn_of_timestep(problem: Problem, floor: Floor, host: mujoco.MjModel) -> tuple[str, ...]:
+    """Say which signal the engine errs most in at the model's timestep, if by far beyond noise.
+
+    Args:
+        problem: The recordings, cut.
+        floor: What noise and the integrator's error make.
+        host: The compiled model.
+    """
+    worst = int(np.argmax(floor.rms))
+    if floor.rms[worst] < COARSE:
+        return ()
+    return (
+        f"at a timestep of {problem.simulator.host.opt.timestep:g} s the engine's own error is "
+        f"{floor.rms[worst]:.0f} times the noise of {signals(host)[worst].name}; give the model a "
+        "smaller timestep, and the recordings will show more",
+    )
 
 
 def warn_of_fitted(problem: Problem, fitted: Fit, host: mujoco.MjModel) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import pytest
 from garat_jax import cli
 from garat_jax.diagnosis import Recording, compare, diagnose, load_model
 from garat_jax.diagnosis.report import diagnosis_lead
+from garat_jax.dynamics import Override
 from garat_jax.effects import CATALOGUE
 
 SERVO = """
@@ -20,7 +21,7 @@ SERVO = """
   <actuator><position name="motor" joint="hinge" kp="{kp}"/></actuator>
 </mujoco>
 """
-AT_ONCE, SLOWLY = 3000, 1110  # above about 1065 the integrator cannot hold the servo
+SOFT, SLOWLY, AT_ONCE = 200, 1110, 3000  # above about 1065 the integrator cannot hold the servo
 
 
 def write(folder, kp):
@@ -84,3 +85,14 @@ def test_an_integrator_that_errs_more_than_the_signals_move_makes_no_verdict(tmp
     assert diagnosis_lead(found).endswith("segments were shortened to 0.2 s.")
     finer = dataclasses.replace(found.error, integrator=0.1)
     assert not finer.is_too_coarse
+
+
+def test_a_timestep_that_errs_beyond_the_noise_is_warned_of(tmp_path):
+    path, files = write(tmp_path, SOFT)
+    model = load_model(path, {"viscous_damping": CATALOGUE["viscous_damping"]})
+    recordings = [Recording.read(file, model) for file in files]
+    finer = dataclasses.replace(model, overrides=(Override("option", "", "timestep", 1e-4),))
+    (warning,) = diagnose(model, recordings).warnings
+    assert "at a timestep of 0.01 s the engine's own error is" in warning
+    assert "times the noise of qvel.hinge; give the model a smaller timestep" in warning
+    assert not any("timestep" in line for line in diagnose(finer, recordings).warnings)
