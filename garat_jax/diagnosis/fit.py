@@ -57,6 +57,7 @@ def fit(
     free,
     rival: float = np.inf,
     sensitivity: np.ndarray | None = None,
+    searches: bool = True,
 ) -> Fit:
     """Fit some parameters within their bounds, and every initial state.
 
@@ -72,6 +73,7 @@ def fit(
         rival: Cost on the fitted segments that another fit reached; steps that promise no more than
             `BEATEN` times that are not taken; beyond `SEARCHED_WITHIN` times there is no search.
         sensitivity: Derivatives by the initial states from nearby; see `linearise`.
+        searches: Whether a search may go on; not needed from near the minimum.
     """
     theta, free = np.array(theta, float), tuple(free)
     if not free:
@@ -93,7 +95,7 @@ def fit(
     cost = np.sum(settled.residual[problem.fitted] ** 2)
     if cost < SEARCHED_WITHIN * rival and not np.all(there.is_clear[keep]):
         settled = settle(problem, theta, start)
-        found, lin, keep = _fit_across_contacts(problem, settled, there, free)
+        found, lin, keep = _fit_across_contacts(problem, settled, there, free, searches)
         theta, start, settled = found.theta, found.start, lin._replace(start=found.sensitivity)
     low, high = interval(problem, theta, lin, free, keep)
     frozen = tuple(j for j, kept in zip(free, keep, strict=True) if not kept)
@@ -166,7 +168,7 @@ def wide(problem: Problem, near: Fit, free, relative) -> Linearisation:
     return Linearisation(near.residual, np.stack(columns, -1), nothing)
 
 
-def _fit_across_contacts(problem: Problem, near: Fit, differences: Differences, free):
+def _fit_across_contacts(problem: Problem, near: Fit, differences: Differences, free, searches):
     """Search if more is left than noise, and take Gauss-Newton steps with `wide` differences.
 
     Args:
@@ -174,12 +176,13 @@ def _fit_across_contacts(problem: Problem, near: Fit, differences: Differences, 
         near: What Gauss-Newton steps have reached, initial states settled.
         differences: Those there; they are kept where they are wider than `WIDE`.
         free: Indices of the parameters to fit.
+        searches: Whether to search.
 
     Returns:
         The best that was reached, the linearisation there, and which parameters are excited.
     """
     relative = np.maximum(differences.relative, WIDE)
-    if _cost(problem, near) > SEARCHED_ABOVE * problem.expected[problem.fitted].sum():
+    if searches and _cost(problem, near) > SEARCHED_ABOVE * problem.expected[problem.fitted].sum():
         found = settle(problem, _search(problem, near, free, relative), near.start)
         near = min((near, found), key=partial(_cost, problem))
     stepped = _wide_step(problem, near, free, relative)

@@ -151,9 +151,16 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
     chosen = _chosen(problem)
     some, near = problem.take(chosen), fitted.take(chosen)
     before, change = near, np.zeros(len(free))
-    for _ in range(REFINEMENTS):
+    for number in range(REFINEMENTS):
         some, before = _finer(some, near)
-        near = fit(some, before.theta, before.start, free, sensitivity=before.sensitivity)
+        near = fit(
+            some,
+            before.theta,
+            before.start,
+            free,
+            sensitivity=before.sensitivity,
+            searches=number == 0,
+        )
         differences = clear_differences(some, near.theta, near.start, free)
         if _are_smooth(differences, _excited(near)):
             near, _ = converge(some, near, differences)
