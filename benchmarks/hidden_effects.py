@@ -214,6 +214,8 @@ def main() -> None:
         return
     cases = shuffled(list_cases(arguments.seed), arguments.seed)
     num_cases = len(cases)
+    if arguments.anew and not arguments.extend:
+        parser.error("--anew needs --extend: it is said of which rows are kept")
     if arguments.only:
         cases = [c for c in cases if any(text in c.name for text in arguments.only)]
     cases = cases[: arguments.sample]
@@ -226,7 +228,7 @@ def main() -> None:
     lines = report(rows)
     picked = arguments.only or arguments.robots != list(ROBOTS)
     if not picked and not any(row["status"] == score.NOT_YET for row in rows):
-        details = {"cases": num_cases, "sample": len(rows), "table": lines}
+        details = {"cases": num_cases, "sample": len(rows), "anew": arguments.anew, "table": lines}
         name, seeds = result_name(arguments.seed), [arguments.seed]
         print(write_result(name, rows, seeds=seeds, command=command, details=details))
 

@@ -199,7 +199,7 @@ def target_steps(arguments: Arguments, name: str) -> int:
 
 
 def recorded(arguments: Arguments) -> tuple[Kept, Kept]:
-    """Return the rows of the result file, of worlds and of targets.
+    """Return the rows of the result file, of worlds and of targets; none where there is no file.
 
     Not those of a target whose `TIMES`, or whose pair's trust region, changed.
 
@@ -207,6 +207,8 @@ def recorded(arguments: Arguments) -> tuple[Kept, Kept]:
         SystemExit: They have another number of steps.
     """
     path = result_path(NAME, arguments.out)
+    if not path.exists():
+        return {}, {}
     result = json.loads(path.read_text(encoding="utf-8"))
     worlds, sizes = result["rows"], {row["steps"][-1] for row in result["rows"]}
     if sizes - {arguments.steps}:

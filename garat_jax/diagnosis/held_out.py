@@ -24,7 +24,7 @@ from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle
 
 COARSE = 3.0
-"""Noise and the timestep's error, in standard deviations of noise, from which a warning says so."""
+"""The timestep's error, in standard deviations of a signal's noise, that a warning is given of."""
 
 
 def errors_of(
@@ -114,12 +114,13 @@ def warn_of_timestep(problem: Problem, floor: Floor, host: mujoco.MjModel) -> tu
         floor: What noise and the integrator's error make.
         host: The compiled model.
     """
-    worst = int(np.argmax(floor.rms))
-    if floor.rms[worst] < COARSE:
+    error = np.sqrt(np.nan_to_num(floor.rms, nan=1.0) ** 2 - 1.0)  # beside noise, which is 1
+    worst = int(np.argmax(error))
+    if error[worst] < COARSE:
         return ()
     return (
         f"at a timestep of {problem.simulator.host.opt.timestep:g} s the engine's own error is "
-        f"{floor.rms[worst]:.0f} times the noise of {signals(host)[worst].name}; give the model a "
+        f"{error[worst]:.0f} times the noise of {signals(host)[worst].name}; give the model a "
         "smaller timestep, and the recordings will show more",
     )
 

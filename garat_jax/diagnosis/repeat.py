@@ -136,8 +136,9 @@ def _alone(
         say(f"fitting {recording.name} alone")
         own = whole.segments.recording == index
         alone = whole.take(own)
-        fitted = count_timestep(alone, fit(alone, theta, settled.start[own], free))
-        needs = [_need(alone, fitted, number, len(selected)) for number in range(len(selected))]
+        found = fit(alone, theta, settled.start[own], free)
+        needs = [_need(alone, found, number, len(selected)) for number in range(len(selected))]
+        fitted = count_timestep(alone, found)
         for place, (j, parameter) in enumerate(free.items()):
             seen = j not in fitted.frozen
             numbers = (fitted.theta[j], fitted.low[place], fitted.high[place])

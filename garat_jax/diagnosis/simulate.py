@@ -24,7 +24,9 @@ from garat_jax.errors import UserError
 
 NUM_PROGRAMS = 40
 """How many programs stay compiled: on a CPU one takes some 250 of a process's 65,530 memory maps,
-and a diagnosis has two simulators, of up to two batch sizes a program."""
+and a diagnosis has two simulators, of up to two batch sizes a program ..."""
+NUM_FINER_PROGRAMS = 4
+"""... and, where contacts make the timestep err, four at finer timesteps."""
 BATCH_SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
 substep, many simulations share its cost. Each size is compiled once."""
@@ -127,7 +129,8 @@ class Simulator:
         self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
         self._transform = model.transform
         self._any_at_once = dynamics.steps_at_once(self._alone) and model.transform is None
-        self._jitted = functools.lru_cache(NUM_PROGRAMS)(self._jit)
+        num_programs = NUM_PROGRAMS if refine <= 2 else NUM_FINER_PROGRAMS
+        self._jitted = functools.lru_cache(num_programs)(self._jit)
 
     @property
     def host(self):

@@ -42,11 +42,12 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
 
     At the model's own timestep a parameter also makes up for the integrator's error, which may be
     many times the noise. What half the timestep does is extrapolated, unless it does much less or
-    more than sensitivities promise, or a timestep of 0 would explain less than the fit does, as
-    across contacts. Where the timestep's error is above the noise, estimates are then those of fits
-    at finer timesteps. Where it is below, they stay, fits at the whole and at half the timestep say
-    how far they are from those at 0, and their intervals reach as far. Where contacts make the cost
-    rough, that of a smooth surface counts; see `smooth_minimum`.
+    more than sensitivities promise, or a timestep of 0 would explain less than the fit does. Then,
+    and where contacts make predictions jump, estimates are those of fits at finer timesteps if the
+    timestep's error is above the noise. If it is below, jumps or not, the minimum of a smooth
+    surface through a rough cost counts (see `smooth_minimum`); where that is not extrapolated, fits
+    at the whole and at half the timestep say how far it is from one at 0, and intervals reach as
+    far.
     """
     if not np.any(_excited(fitted)):
         return fitted
@@ -145,13 +146,17 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
 
     The integrator's error falls with the timestep. But contacts hold a fit back on its way: what
     the last timestep changed may be to come once more, and counts as unsure. The noise is the same
-    at each, so that an interval that is narrower than at the timestep before is so by chance.
+    at each, so that an interval that is narrower than at the timestep before is so by chance. Where
+    a finer timestep explains less, the estimates stay, and their intervals reach as far.
     """
-    free = list(fitted.free)
+    excited = _excited(fitted)
+    free = np.asarray(fitted.free)[excited]
     chosen = _chosen(problem)
     some, near = problem.take(chosen), fitted.take(chosen)
-    before, change = near, np.zeros(len(free))
+    coarse, change = _left(some, near), np.zeros(len(free))
+    half = half_before = (fitted.high - fitted.low)[excited] / 2
     for number in range(REFINEMENTS):
+        half_before = half
         some, before = _finer(some, near)
         near = fit(
             some,
@@ -164,23 +169,40 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
         differences = clear_differences(some, near.theta, near.start, free)
         if _are_smooth(differences, _excited(near)):
             near, _ = converge(some, near, differences)
-        change = (near.theta - before.theta)[free]
-        if np.all(np.abs(change) <= SETTLED * (near.high - near.low)):
+        change, half = (near.theta - before.theta)[free], (near.high - near.low) / 2
+        if np.all(np.abs(change) <= SETTLED * half):
             break
-    half = np.maximum(near.high - near.low, before.high - before.low) / 2
+    half = np.maximum(half, half_before)
     is_told = np.isfinite(half)
-    half, change = half[is_told], change[is_told]
-    low, high, centre = fitted.low.copy(), fitted.high.copy(), near.theta[free][is_told]
-    low[is_told] = centre - half + np.minimum(change, 0.0)
-    high[is_told] = centre + half + np.maximum(change, 0.0)
-    return dataclasses.replace(follow(problem, near.theta, fitted), low=low, high=high)
+    theta, low, high = fitted.theta.copy(), fitted.low.copy(), fitted.high.copy()
+    theta[free[is_told]] = near.theta[free[is_told]]
+    ends = near.theta[free] - half + np.minimum(change, 0.0)
+    low[excited] = np.where(is_told, ends, low[excited])
+    ends = near.theta[free] + half + np.maximum(change, 0.0)
+    high[excited] = np.where(is_told, ends, high[excited])
+    if _left(some, near) > EXPLAINED * coarse:
+        low, high = np.minimum(low, fitted.low), np.maximum(high, fitted.high)
+        return dataclasses.replace(fitted, low=low, high=high)
+    return dataclasses.replace(follow(problem, theta, fitted), low=low, high=high)
+
+
+def _left(problem: Problem, fitted: Fit) -> float:
+    """Return what a fit leaves, relative to noise."""
+    return float(fitted.cost.sum() / problem.expected.sum())
 
 
 def _chosen(problem: Problem) -> np.ndarray:
-    """Return the indices of the segments that are fitted again, evenly chosen."""
+    """Return the indices of the segments that are fitted again, evenly chosen.
+
+    Of a recording that is left out, the first count, too: it may be the only one of a condition.
+    """
     fitted = np.flatnonzero(problem.fitted)
+    recordings = problem.segments.recording[fitted]
     apart = max(1, len(fitted) // REFITTED)
-    return fitted[np.arange(len(fitted)) // IN_A_ROW % apart == 0]
+    is_chosen = np.arange(len(fitted)) // IN_A_ROW % apart == 0
+    for recording in np.setdiff1d(recordings, recordings[is_chosen]):
+        is_chosen[np.flatnonzero(recordings == recording)[:IN_A_ROW]] = True
+    return fitted[is_chosen]
 
 
 def _finer(problem: Problem, near: Fit) -> tuple[Problem, Fit]:

@@ -1,5 +1,6 @@
 """Estimates where the timestep's error cannot be extrapolated."""
 
+import dataclasses
 from pathlib import Path
 
 import mujoco
@@ -9,6 +10,8 @@ import pytest
 from garat_jax.diagnosis import timestep
 from garat_jax.diagnosis.differences import clear_differences
 from garat_jax.diagnosis.fit import converge, fit
+from garat_jax.diagnosis.held_out import warn_of_timestep
+from garat_jax.diagnosis.metric import Floor
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.starts import follow, settle
 from garat_jax.diagnosis.timestep import count_timestep
@@ -51,6 +54,45 @@ def test_a_shift_that_does_less_or_more_than_promised_is_not_made(monkeypatch, k
     if made:
         shift = abs(counted.theta[0] - found.theta[0])
         assert counted.high[0] - counted.low[0] > 2 * abs(1 - kept) * shift
+
+
+class Shifted:
+    """A simulator in which damping acts more, by an error that is as large as the timestep."""
+
+    def __init__(self, simulator, more: float):
+        self._simulator, self._more = simulator, more
+        self.effects, self.slots, self.base = simulator.effects, simulator.slots, simulator.base
+        self.host = simulator.host
+
+    def predict(self, theta, start, segments):
+        return self._simulator.predict(theta + self._more, start, segments)
+
+    def refined(self, factor: int):
+        return Shifted(self._simulator, self._more / factor)
+
+
+def test_fits_at_the_whole_and_half_the_timestep_say_how_far_the_whole_is_from_none():
+    recordings = [record(UNIFORM, damping=0.02)]
+    problem = make_problem(recordings, [ViscousDamping("joint/hinge")])
+    problem = dataclasses.replace(problem, simulator=Shifted(problem.simulator, 0.004))
+    found = converged(problem, np.array([0.02]))
+    assert found.theta[0] == pytest.approx(0.016, rel=0.05)
+    assert timestep._shift_by_fits(problem, found)[0] == pytest.approx(0.004, rel=0.05)
+    finer = timestep._at_finer_timesteps(problem, found)
+    assert finer.theta[0] == pytest.approx(0.02 - 0.004 / 16, rel=0.03)
+    assert finer.low[0] < 0.02 < finer.high[0]
+
+
+def test_segments_that_are_fitted_again_are_of_every_recording():
+    recordings = [record(np.arange(6000) * 0.004), record(np.arange(400) * 0.004, seed=1)]
+    problem = make_problem(recordings, [ViscousDamping("joint/hinge")], horizon=0.2)
+    problem = dataclasses.replace(problem, fitted=problem.fitted & (problem.segments.first > 0))
+    chosen = timestep._chosen(problem)
+    assert timestep.REFITTED <= len(chosen) < 2.5 * timestep.REFITTED
+    assert np.all(problem.fitted[chosen])
+    assert set(problem.segments.recording[chosen]) == {0, 1}
+    (gaps,) = np.unique(np.diff(chosen[problem.segments.recording[chosen] == 0])).reshape(1, -1)
+    assert gaps[0] == 1 and len(gaps) == 2  # some in a row, the next ones farther on
 
 
 def test_where_noise_is_above_the_timesteps_error_an_interval_reaches_as_far(monkeypatch):
@@ -110,3 +152,12 @@ def test_what_a_fit_stopped_short_of_is_no_error_of_the_timestep():
     expected = count_timestep(problem, found)
     counted = count_timestep(problem, short)
     assert counted.theta[0] == pytest.approx(expected.theta[0], rel=1e-3)
+
+
+def test_a_signal_that_was_not_held_out_is_not_warned_of():
+    problem = make_problem([record(UNIFORM)], ())
+    host = problem.simulator.host
+    floor = Floor(0.1, np.ones(2), np.array([1.5, np.nan]))
+    assert warn_of_timestep(problem, floor, host) == ()
+    (warning,) = warn_of_timestep(problem, floor._replace(rms=np.array([np.hypot(1, 4), 2])), host)
+    assert "the engine's own error is 4 times the noise of qpos.hinge" in warning
