@@ -22,11 +22,9 @@ from garat_jax.dynamics import Override
 from garat_jax.effects import Effect, Parameter
 from garat_jax.errors import UserError
 
-NUM_PROGRAMS = 40
+NUM_PROGRAMS, NUM_FINER = 40, 4
 """How many programs stay compiled: on a CPU one takes some 250 of a process's 65,530 memory maps,
-and a diagnosis has two simulators, of up to two batch sizes a program ..."""
-NUM_FINER_PROGRAMS = 4
-"""... and, where contacts make the timestep err, four at finer timesteps."""
+and a diagnosis has two simulators, of up to two batch sizes a program, and four finer ones."""
 BATCH_SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
 substep, many simulations share its cost. Each size is compiled once."""
@@ -113,7 +111,6 @@ class Simulator:
         self._substeps = grid.substeps * refine
         self._warm_up = warm_up_steps(grid, self.host.nu)
         self._grid = grid
-        self._on_grid = grid.uniform
         self.slots = tuple(
             Slot(i, p, float(getattr(effect, p.name)))
             for i, effect in enumerate(candidates)
@@ -129,8 +126,7 @@ class Simulator:
         self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
         self._transform = model.transform
         self._any_at_once = dynamics.steps_at_once(self._alone) and model.transform is None
-        num_programs = NUM_PROGRAMS if refine <= 2 else NUM_FINER_PROGRAMS
-        self._jitted = functools.lru_cache(num_programs)(self._jit)
+        self._jitted = functools.lru_cache(NUM_PROGRAMS if refine <= 2 else NUM_FINER)(self._jit)
 
     @property
     def host(self):
@@ -202,7 +198,7 @@ class Simulator:
             starts = np.broadcast_to(start, (len(both), *start.shape))
             chosen = self._blind if way == "at once" else self._acting(both)
             if way == "along":
-                run, along = self._along(chosen), path[0]
+                run, along = self._jitted("along", chosen), path[0]
             else:
                 run, along = self._program(chosen), None
             changed = self._in_batches(run, segments, both, starts, along)[0]
@@ -253,10 +249,6 @@ class Simulator:
         if self._any_at_once and {*chosen} <= {*self._blind}:
             return self._jitted("at once", chosen)
         return self._jitted("stepped", chosen)
-
-    def _along(self, chosen: tuple[int, ...]) -> Program:
-        """Return the compiled program in which these candidates look at a given path."""
-        return self._jitted("along", chosen)
 
     def _jit(self, way: str, chosen: tuple[int, ...]) -> Program:
         """Return a program that is compiled when it first runs."""
@@ -396,7 +388,7 @@ class Simulator:
 
     def _at_samples(self, path, place):
         """Interpolate a path on the grid [steps + 1, nq + nv] at the samples."""
-        if self._on_grid:
+        if self._grid.uniform:
             return path
         below = jnp.minimum(place.astype(int), len(path) - 2)
         fraction = (place - below)[:, None]
