@@ -33,7 +33,7 @@ LOST = 10.0
 """Cost of a segment, relative to noise's and to the median segment's, above which its initial state
 was not found."""
 SETTLED = 0.4
-"""What a finer timestep changes, in widths of the interval, below which no still finer one is
+"""What a finer timestep changes, in half-widths of the interval, below which no still finer one is
 tried: a timestep of 0 changes a third of that."""
 
 
