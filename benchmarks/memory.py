@@ -6,6 +6,7 @@ iterations, in a process of its own with an empty compilation cache, because com
 
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,8 @@ from garat_jax import compilation_cache
 
 LIMIT = 2048.0
 """MiB that no pair should need."""
+STAGE = re.compile(r"memory ([\d.]+) MiB of states and ([\d.]+) MiB on the way")
+"""What a stage prints: states that go in and come out, and what an iteration needs besides."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,12 +76,15 @@ def measure(pair: str, arguments: Arguments) -> dict[str, Any]:
         )
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
+    stages = [(float(held), float(way)) for held, way in STAGE.findall(done.stderr)]
     row = {
         "pair": pair,
         "method": arguments.method,
         "engine": arguments.engine,
         "seeds": arguments.seeds,
         "peak_mebibytes": float(done.stdout.split()[-1]),
+        "states_mebibytes": max(states for states, _ in stages),
+        "iteration_mebibytes": max(on_the_way for _, on_the_way in stages),
         "limit_mebibytes": LIMIT,
         "seconds": time.perf_counter() - started,
         "load_average_before": busy,

@@ -226,5 +226,10 @@ def memory() -> str:
 
 
 def _memory(result: dict[str, Any]) -> str:
-    rows = [(row["pair"], f"{row['peak_mebibytes']:,.0f}") for row in result["rows"]]
-    return table((f"{result['rows'][0]['seeds']} seeds", "most memory [MiB]"), rows)
+    parts = ("peak", "iteration", "states")
+    rows = [
+        (row["pair"], *(f"{row[f'{part}_mebibytes']:,.0f}" for part in parts))
+        for row in result["rows"]
+    ]
+    head = ("process", "on the way in an iteration", "states, before and after it")
+    return table((f"{result['rows'][0]['seeds']} seeds, MiB at most", *head), rows)
