@@ -14,7 +14,7 @@ def full_precision(function: Callable[Inputs, Output]) -> Callable[Inputs, Outpu
     """Have the products of matrices in a function, and in its derivatives, keep float32's bits.
 
     By default NVIDIA's GPUs since Ampere round what they multiply to the 10 bits of TF32, and TPUs
-    to the 7 of bfloat16. Networks bear that; physics drifts (google-deepmind/mujoco_playground#86).
+    to the 7 of bfloat16, with which physics drifts (google-deepmind/mujoco_playground#86).
     On a CPU nothing changes.
     """
 
