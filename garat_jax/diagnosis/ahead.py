@@ -146,10 +146,10 @@ def _shared(undecided: Sequence[Path], judged: Judged) -> tuple[Candidate, Conte
     may_pass = second.passes and best.candidate.why in ANOTHER_MAY_HELP
     if not may_pass or not on_all(second.named):
         return None
-    added = (c for path in undecided[1:] for c in path.added)
-    others = (c.named for c in added if second.named not in (c.named, *c.indistinguishable_from))
-    alike = dict.fromkeys([*best.candidate.indistinguishable_from, *others])
-    first = dataclasses.replace(best.candidate, indistinguishable_from=tuple(alike))
+    added = [(c.named, *c.indistinguishable_from) for path in undecided for c in path.added]
+    firsts = dict.fromkeys(n for names in added if second.named not in names for n in names)
+    alike = tuple(named for named in firsts if named != best.candidate.named)
+    first = dataclasses.replace(best.candidate, indistinguishable_from=alike)
     return first, best.contender, True
 
 

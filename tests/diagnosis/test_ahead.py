@@ -41,6 +41,7 @@ def chosen(
     why: str = NO_CERTAIN_LEAD,
     num_held: int = 0,
     why_first: str = NO_CERTAIN_GAIN,
+    like_gravity: tuple[Named, ...] = (),
 ):
     """Choose where damping, gravity and an offset explain 20, 19 and 18 % each by itself.
 
@@ -51,6 +52,7 @@ def chosen(
         why: What is said of these.
         num_held: How many effects are said to be selected.
         why_first: What is said of damping.
+        like_gravity: What is not told from gravity.
     """
     current = settle(problem, problem.simulator.base, problem.segments.start)
     residual = np.random.default_rng(0).normal(size=current.residual.shape)
@@ -79,6 +81,9 @@ def chosen(
         pair(GRAVITY, 0.81, NO_CERTAIN_LEAD),
         pair(OFFSET, 0.82, NO_CERTAIN_LEAD),
     ]
+    gravity, fitted = judged[GRAVITY]
+    gravity = dataclasses.replace(gravity, indistinguishable_from=like_gravity)
+    judged[GRAVITY] = gravity, fitted
     metric = make_metric(problem)
     say = [].append
     judged, steps = choose(problem, metric, current, judged, num_held, follow, say)
@@ -111,6 +116,13 @@ def test_what_all_paths_have_second_is_added_with_a_first_that_is_not_told_from_
     assert added == [named(DAMPING), named(FRICTION)]
     assert first.passes and first.indistinguishable_from == (named(GRAVITY),)
     assert first.why == "passes every gate together with coulomb_friction at joint/hinge"
+
+
+def test_what_is_not_told_from_another_first_is_not_told_from_the_best_either(problem):
+    like = (named(OFFSET),)
+    first, added = chosen(problem, {FRICTION: 0.3}, {FRICTION: 0.301}, PASSES, like_gravity=like)
+    assert added == [named(DAMPING), named(FRICTION)]
+    assert first.indistinguishable_from == (named(GRAVITY), named(OFFSET))
 
 
 def test_what_all_paths_have_second_is_not_added_where_it_does_not_pass(problem):
