@@ -60,9 +60,11 @@ class Sized(NamedTuple):
     @property
     def change(self) -> str:
         """What adding the effect changes on the recordings that it was fitted to."""
+        fell = self.error_after < self.error_before
         return (
             f"error over {self.horizon:g} s on these recordings, of the signals' spread: "
             f"{self.error_before:.3g} → {self.error_after:.3g}"
+            f"{'' if fell else '; it did not fall: they do not speak for this effect alone'}"
         )
 
 

@@ -20,7 +20,7 @@ from garat_jax.diagnosis.horizon import (
     say_horizon,
     warn_of_divergence,
 )
-from garat_jax.diagnosis.judge import SMALLEST_SHARE
+from garat_jax.diagnosis.judge import FEWEST_SEGMENTS, SMALLEST_SHARE
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
@@ -40,8 +40,6 @@ from garat_jax.effects import Effect
 from garat_jax.errors import UserError
 from garat_jax.provenance import versions
 
-FEWEST_SEGMENTS = 3
-"""Segments that have to be fitted for intervals and resamples to mean much."""
 ENOUGH = 250.0
 """Samples a second that a passive mechanism needs."""
 
@@ -86,7 +84,8 @@ def diagnose(
     problem = trusted(problem, settled)
     outcome = explain(problem, everything, grid, settled.start, say)
     problem = outcome.problem
-    warnings += few_segments(problem)
+    too_few = few_segments(problem)
+    warnings += too_few
     warnings += warn_of_fitted(problem, outcome.before, host) if outcome.adequate else ()
     error = errors_of(problem, (outcome.before, outcome.after), outcome.floor, host, how)
     if not error.is_too_coarse:
@@ -106,7 +105,9 @@ def diagnose(
         candidates=outcome.candidates,
         selected=outcome.selected,
         ladder=_ladder(problem, outcome),
-        drifts=find_drifts(problem, outcome.best, everything) if outcome.best else (),
+        drifts=find_drifts(problem, outcome.best, everything)
+        if outcome.best and not too_few
+        else (),
         next_experiment=next_experiment((*outcome.selected, *outcome.candidates[:1]), host),
         warnings=warnings,
         unseen=unseen(problem, outcome.before, explaining),
@@ -216,12 +217,13 @@ def verdict_of(
 
 def _ladder(problem: Problem, outcome: Outcome) -> tuple[Rung, ...]:
     metric = make_metric(problem)
-    fits = [(None, outcome.before), *((step.candidate, step.fit) for step in outcome.steps)]
+    steps = zip(outcome.selected, outcome.steps, strict=True)
+    fits = [(None, outcome.before), *((final, step.fit) for final, step in steps)]
     return tuple(
         Rung(
-            candidate,
+            added,
             metric.error(fitted.residual, problem.fitted),
             metric.error(fitted.residual, ~problem.fitted),
         )
-        for candidate, fitted in fits
+        for added, fitted in fits
     )

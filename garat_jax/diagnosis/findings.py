@@ -61,7 +61,7 @@ class Unseen(Named):
     def size(self) -> str:
         """Up to which size it stays hidden, in words; empty if at any."""
         known = math.isfinite(self.up_to)
-        return f"less than {self.up_to:.2g}{after_number(self.unit)}" if known else ""
+        return f"up to {self.up_to:.2g}{after_number(self.unit)}" if known else ""
 
 
 def list_unseen(unseen: Sequence[Unseen], most: int | None = None) -> str:
@@ -87,7 +87,7 @@ class Candidate:
         share: Share of the fitted residual's squares that it explains.
         p_value: Corrected for the number of candidates.
         error_after: Held-out error with the effect, NaN if it was not fitted.
-        held_out_gain: How much the held-out error falls.
+        held_out_gain: How much the held-out error falls, samples counting as they are trusted.
         stability: Share of block resamples in which it, or one indistinguishable from it, is first.
         indistinguishable_from: Effects that these recordings cannot tell from it.
         passes: Whether it passes every gate.

@@ -238,13 +238,18 @@ def _search(problem: Problem, near: Fit, free, relative) -> np.ndarray:
 def interval(problem: Problem, theta, lin: Linearisation, free, keep):
     """Return 95 % intervals: robust, with blocks of time as the independent units."""
     low, high = np.full(len(free), -np.inf), np.full(len(free), np.inf)
-    if not np.any(keep):
+    if not np.any(keep) or not are_determined(problem, keep):
         return low, high
     covariance, sure = uncertainty(problem, lin, keep)
     half = sure * np.sqrt(np.diag(covariance))
     centre = theta[np.asarray(free)[keep]]
     low[keep], high[keep] = centre - half, centre + half
     return low, high
+
+
+def are_determined(problem: Problem, keep) -> bool:
+    """Say whether there are more blocks of time than excited parameters: else nothing is left."""
+    return len(np.unique(block_labels(problem)[problem.fitted])) > np.sum(keep)
 
 
 def uncertainty(problem: Problem, lin: Linearisation, keep) -> tuple[np.ndarray, float]:

@@ -23,11 +23,14 @@ STABLE = 0.8
 NEGLIGIBLE = 0.01
 """Part of the fall of the held-out error by which a resample may rise: one without any moment at
 which the effect acts shows next to no change."""
+FEWEST_SEGMENTS = 3
+"""Fitted segments below which nothing is certain."""
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 ROUNDING = 1e-9
 """Distance from a bound, relative to a parameter's `scale`, that is only rounding: descents
 reach bounds by adding steps."""
+TOO_FEW = "too few pieces of recordings to be certain"
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
 BEHIND = "another explains more for certain"
 NO_CERTAIN_GAIN = "the held-out error does not fall for certain"
@@ -158,7 +161,8 @@ def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, al
             lead = -np.inf
     gain = held_out_gain(problem, metric, current, contender.fit)
     share = 1.0 - contender.fit.cost[problem.fitted].sum() / current.cost[problem.fitted].sum()
-    why = _failed_gate(contender.score, share, gain, lead, stability)
+    is_enough = problem.fitted.sum() >= FEWEST_SEGMENTS
+    why = _failed_gate(contender.score, share, gain, lead, stability) if is_enough else TOO_FEW
     effects = problem.simulator.effects
     named = [effects[contenders[i].score.effect] for i in alike]
     candidate = Candidate(

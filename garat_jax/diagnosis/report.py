@@ -102,6 +102,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
             f"Something is missing, but none of {rivals} explains more than the others for "
             f"certain, and none is added: {diagnosis.rest}."
         )
+    if diagnosis.is_too_short:
+        return diagnosis.sentence
     return f"Something is missing that no effect in the catalogue explains: {diagnosis.rest}."
 
 
@@ -335,20 +337,19 @@ def _ranking(diagnosis: Diagnosis) -> list[Section]:
         drawn.append(
             Figure(
                 figures.ranking(diagnosis.candidates),
-                "How much the error on held-out recordings falls if this effect alone is added and "
-                "fitted, with its 95 % interval. Green: it passes every test. Grey: it does not; "
-                "the table says why. An arrow at the edge: the error rises by more than shown.",
+                "By how much the held-out recordings' error falls if this effect alone is fitted, "
+                "and its 95 % interval; samples that the timestep makes hard to predict count less."
+                " Green: it passes every test. Grey: the table says why not. An arrow: beyond.",
                 "What each effect would explain",
             )
         )
     return [
         Section(
             "Which effects could explain it",
-            "Every effect of the catalogue was tried wherever it can act: not at parts without a "
-            "name, and not where a part lacks what it needs, as a joint without armature does for "
-            "flexibility, or a geom that touches nothing for friction. Only one that "
-            "explains much, that makes the error fall on recordings it was not fitted to, that "
-            "leads over all others for certain and that has a possible sign is added.",
+            "Every effect of the catalogue was tried wherever it can act: where a part has a name "
+            "and what it needs, as flexibility needs a joint's armature, friction a geom that can "
+            "touch another. Only one is added that explains much, lowers the error on recordings "
+            "it was not fitted to, leads over all others for certain and has a possible sign.",
             figures=drawn,
             tables=[
                 Table(
@@ -387,9 +388,8 @@ def _parameters(diagnosis: Diagnosis, model: Model) -> list[Section]:
         for c in diagnosis.selected
         for name, e in c.parameters.items()
     ]
-    laws = "\n".join(
-        f"- {words(c.effect)}: {model.catalogue[c.effect].law}" for c in diagnosis.selected
-    )
+    kinds = dict.fromkeys(c.effect for c in diagnosis.selected)
+    laws = "\n".join(f"- {words(kind)}: {model.catalogue[kind].law}" for kind in kinds)
     columns = ["effect", "parameter", "estimate", "low", "high", "unit"]
     caption = "Estimates and their 95 % intervals; – where the recordings say nothing."
     return [Section("What was added", laws, tables=[Table(columns, rows, caption)])]

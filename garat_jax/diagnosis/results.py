@@ -17,7 +17,7 @@ from garat_jax.diagnosis.findings import (
     Unseen,
     list_unseen,
 )
-from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD, SMALLEST_SHARE
+from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD, SMALLEST_SHARE, TOO_FEW
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.metric import ABOVE_FLOOR
 from garat_jax.errors import choose
@@ -179,8 +179,7 @@ class Diagnosis:
         """Say what a rung of the ladder adds, at its final size."""
         if rung.added is None:
             return "the model as it is"
-        sizes = {c.named: c.sizes for c in self.selected}
-        return f"+ {rung.added.named} ({sizes[rung.added.named]})"
+        return f"+ {rung.added.named} ({rung.added.sizes})"
 
     def under(self, condition: str) -> tuple[Candidate, ...]:
         """Return all effects under a condition: the shared ones, some replaced, and its own."""
@@ -232,7 +231,14 @@ class Diagnosis:
             return f"Found {names}; {fall}; but {self.rest}."
         if rivals := self.rivals():
             return f"None of {rivals} leads for certain, and none is added: {self.rest}."
+        if self.is_too_short:
+            return f"Too little was recorded to be certain of what is missing: {self.rest}."
         return f"Nothing in the catalogue explains the error: {self.rest}."
+
+    @property
+    def is_too_short(self) -> bool:
+        """Whether too little could be fitted to be certain of any effect."""
+        return any(candidate.why == TOO_FEW for candidate in self.candidates)
 
     def rivals(self, spell: Callable[[Named], str] = str) -> str:
         """Spell the first candidates that only rivals keep back; empty if there are not several."""

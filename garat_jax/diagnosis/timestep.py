@@ -3,9 +3,18 @@
 import dataclasses
 
 import numpy as np
+from scipy import stats
 
 from garat_jax.diagnosis.differences import STEP, Differences, clear_differences, projected
-from garat_jax.diagnosis.fit import WIDE, converge, fit, interval, uncertainty, wide
+from garat_jax.diagnosis.fit import (
+    WIDE,
+    are_determined,
+    converge,
+    fit,
+    interval,
+    uncertainty,
+    wide,
+)
 from garat_jax.diagnosis.metric import timestep_error, trusted
 from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels
 from garat_jax.diagnosis.robust import regress
@@ -32,6 +41,8 @@ IN_A_ROW = 4
 LOST = 10.0
 """Cost of a segment, relative to noise's and to the median segment's, above which its initial state
 was not found."""
+GROUPS = 6
+"""Groups of segments, each fitted by itself, that say by how much fits across contacts scatter."""
 SETTLED = 0.4
 """What a finer timestep changes, in half-widths of the interval, below which no still finer one is
 tried: a timestep of 0 changes a third of that."""
@@ -49,10 +60,11 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     at the whole and at half the timestep say how far it is from one at 0, and intervals reach as
     far.
     """
-    if not np.any(_excited(fitted)):
+    excited = _excited(fitted)
+    if not np.any(excited) or not are_determined(problem, excited):
         return fitted
     differences = clear_differences(problem, fitted.theta, fitted.start, fitted.free)
-    are_smooth = _are_smooth(differences, _excited(fitted))
+    are_smooth = _are_smooth(differences, excited)
     if not are_smooth and _is_coarse(problem, fitted):
         return _at_finer_timesteps(problem, fitted)
     if are_smooth:
@@ -172,7 +184,7 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
         change, half = (near.theta - before.theta)[free], (near.high - near.low) / 2
         if np.all(np.abs(change) <= SETTLED * half):
             break
-    half = np.maximum(half, half_before)
+    half = np.maximum.reduce([half, half_before, _scatter(some, near, free)])
     is_told = np.isfinite(half)
     theta, low, high = fitted.theta.copy(), fitted.low.copy(), fitted.high.copy()
     theta[free[is_told]] = near.theta[free[is_told]]
@@ -184,6 +196,27 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
         low, high = np.minimum(low, fitted.low), np.maximum(high, fitted.high)
         return dataclasses.replace(fitted, low=low, high=high)
     return dataclasses.replace(follow(problem, theta, fitted), low=low, high=high)
+
+
+def _scatter(problem: Problem, near: Fit, free: np.ndarray) -> np.ndarray:
+    """Return the free parameters' half-widths by how fits to groups of segments scatter, [k].
+
+    Across contacts a cost has many minima, which lie elsewhere for other segments: what derivatives
+    at one of them say of the noise is too little. Student's t of the groups' mean.
+    """
+    groups = np.arange(len(near.start)) // IN_A_ROW % GROUPS
+    found = []
+    for group in np.unique(groups):
+        chosen = np.flatnonzero(groups == group)
+        some, there = problem.take(chosen), near.take(chosen)
+        fitted = fit(
+            some, there.theta, there.start, free, sensitivity=there.sensitivity, searches=False
+        )
+        found.append(fitted.theta[free])
+    if len(found) < 2:
+        return np.zeros(len(free))
+    wide = stats.t.ppf(0.975, len(found) - 1)
+    return wide * np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
 
 
 def _left(problem: Problem, fitted: Fit) -> float:
