@@ -13,7 +13,7 @@ from garat_jax.diagnosis.differences import clear_differences, projected
 from garat_jax.diagnosis.findings import Estimate
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
-from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
 from garat_jax.diagnosis.problem import Problem
@@ -168,7 +168,7 @@ def size(
     Raises:
         UserError: Nothing is left to fit, or the recordings excite none of it.
     """
-    recordings = thin(recordings)
+    recordings = thin(checked(recordings))
     host = native_model(model.compile(engine="mujoco"))
     grid = choose_grid(recordings, host.opt.timestep)
     simulator = Simulator(model, (effect,), grid)

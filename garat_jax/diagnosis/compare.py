@@ -16,7 +16,7 @@ from garat_jax.diagnosis.diagnose import thin
 from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
-from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, check_same_machine, load_model
 from garat_jax.diagnosis.problem import Problem
@@ -29,6 +29,7 @@ from garat_jax.diagnosis.segments import Grid, choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.torque import TorqueError, compare_torques
+from garat_jax.diagnosis.units import after_number
 from garat_jax.diagnosis.unseen import STILL, is_still
 from garat_jax.dynamics import native_model
 from garat_jax.effects.base import element_names
@@ -109,10 +110,9 @@ class Comparison:
         for name, row in self.error.per_signal.items():
             moves = np.isfinite(row["fit_percent"])
             fit = f"fit {row['fit_percent']:.1f} %" if moves else "hardly moves"
-            lines.append(
-                f"  {name}: {row['before']:.4g} {row['unit']} ({fit}, "
-                f"noise {row['noise_floor']:.2g} {row['unit']})"
-            )
+            unit = after_number(str(row["unit"]))
+            floor = f"floor {row['noise_floor']:.2g}{unit}"
+            lines.append(f"  {name}: {row['before']:.4g}{unit} ({fit}, {floor})")
         lines += [f"  torque at {torque.sentence}" for torque in self.torques]
         if self.also:
             lines.append(f"  error over {self.horizon:g} s, % of the signals' spread:")
@@ -157,7 +157,7 @@ def compare(
         UserError: Another model has other joints or actuators.
     """
     started = time.monotonic()
-    host = native_model(model.compile(engine="mujoco"))
+    host, recordings = native_model(model.compile(engine="mujoco")), checked(recordings)
     for other in also:
         theirs = other.compile(engine="mujoco").host.model
         check_same_machine(other.path, theirs, model.path, host)

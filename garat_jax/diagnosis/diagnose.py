@@ -23,7 +23,7 @@ from garat_jax.diagnosis.horizon import (
 from garat_jax.diagnosis.judge import FEWEST_SEGMENTS, SMALLEST_SHARE
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import localise, missing_torque
-from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
@@ -63,7 +63,7 @@ def diagnose(
             that is selected takes its place.
     """
     started = time.monotonic()
-    fitted, held_out, how = split(recordings, holdout)
+    fitted, held_out, how = split(checked(recordings), checked(holdout, least=0))
     everything = thin((*fitted, *held_out))
     whole = dataclasses.replace(model, effects=(*model.effects, *shared))
     host = native_model(whole.compile(engine="mujoco"))

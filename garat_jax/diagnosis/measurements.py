@@ -53,6 +53,10 @@ class Recording:
     spans: tuple[tuple[int, int], ...]
     warnings: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        seconds = self.time[-1] - self.time[0]
+        return f"Recording({self.name!r}, {len(self.time)} samples in {seconds:.3g} s)"
+
     @classmethod
     def read(
         cls,
@@ -99,6 +103,24 @@ class Recording:
             warnings=(),
         )
         return dataclasses.replace(recording, warnings=(*warnings, *oddities(recording, model)))
+
+
+def checked(recordings: Sequence[Recording], least: int = 1) -> Sequence[Recording]:
+    """Return recordings as they are if that is what they are, and at least so many.
+
+    Raises:
+        UserError: They are something else, as a path or a single recording is, or too few.
+    """
+    if isinstance(recordings, Recording | str | Path):
+        raise UserError(f"expected a list of recordings, not {recordings!r} alone; write [...]")
+    for recording in recordings:
+        if not isinstance(recording, Recording):
+            raise UserError(
+                f"expected recordings, not {recording!r}; Recording.read(path, model) reads one"
+            )
+    if len(recordings) < least:
+        raise UserError("there are no recordings; give at least one")
+    return recordings
 
 
 def _read(path: str | Path, model: mujoco.MjModel, column_map: ColumnMap | None) -> Table:

@@ -14,12 +14,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from garat_jax.diagnosis.own_effects import compile_own
 from garat_jax.dynamics import Dynamics, Override, compile
 from garat_jax.effects import CATALOGUE, Effect
 from garat_jax.effects.base import element_names
 from garat_jax.effects.catalogue import Catalogue, load_catalogue
 from garat_jax.env import Task, TaskEnv, Transform, World
-from garat_jax.errors import UserError, choose, unknown_name
+from garat_jax.errors import UserError, unknown_name
 from garat_jax.overrides import load_spec
 
 FORMAT = "garat-model/1"
@@ -51,16 +52,16 @@ class Model:
     name: str
     path: Path
     mjcf: Path
-    spec: mujoco.MjSpec
+    spec: mujoco.MjSpec = dataclasses.field(repr=False)
     overrides: tuple[Override, ...] = ()
     effects: tuple[Effect, ...] = ()
-    catalogue: Catalogue = dataclasses.field(default_factory=lambda: CATALOGUE)
+    catalogue: Catalogue = dataclasses.field(default_factory=lambda: CATALOGUE, repr=False)
     transform: Transform | None = None
     interval: float | None = None
 
     def compile(self, engine: str = "auto", extra_effects: Sequence[Effect] = ()) -> Dynamics:
-        """Compile the model, with more effects after its own; see `dynamics.compile`."""
-        return compile(self.spec, self.overrides, (*self.effects, *extra_effects), engine)
+        """Compile the model, with more effects after its own; see `compile_own`."""
+        return compile_own(self.spec, self.overrides, (*self.effects, *extra_effects), engine)
 
     def world(self, task: Task, engine: str = "auto") -> World:
         """Return a task in this model, to train in: with its effects, and its action transformer.
@@ -245,7 +246,9 @@ def _effect(table: dict[str, Any], catalogue: Catalogue) -> Effect:
     kind, target, parameters = (table[key] for key in EFFECT_KEYS)
     if not isinstance(kind, str) or not isinstance(target, str) or not isinstance(parameters, dict):
         raise UserError("[[effect]] needs names for kind and target and a table of parameters")
-    return make_effect(choose("effect", kind, catalogue), target, parameters)
+    if kind not in catalogue:
+        raise UserError(f"{unknown_name('effect', kind, catalogue)}; --effects FILE.py adds others")
+    return make_effect(catalogue[kind], target, parameters)
 
 
 def make_effect(cls: type[Effect], target: str, parameters: Mapping[str, Any]) -> Effect:

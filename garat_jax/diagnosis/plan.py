@@ -114,7 +114,7 @@ def plan(
     model: Model,
     first: Place | str,
     second: Place | str,
-    seconds: float,
+    seconds: float = 8.0,
     seed: int = 0,
     say: Callable[[str], None] = lambda message: None,
 ) -> Planned:

@@ -165,7 +165,7 @@ def write_comparison(
     facts = [
         Fact(_percent(error.before), "error, of each signal's spread"),
         Fact(_percent(error.noise_floor), "noise floor: what noise and the integrator alone make"),
-        Fact(str(len(recordings)), "recordings"),
+        Fact(str(len(recordings)), "recording" + "s" * (len(recordings) != 1)),
     ]
     return report.write(
         run.path("report.html"),

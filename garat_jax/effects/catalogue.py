@@ -69,11 +69,11 @@ def run_python(path: Path, option: str) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
-        raise UserError(f"{path}{_line(path, error)}: {type(error).__name__}: {error}") from error
+        raise UserError(f"{path}{line_in(path, error)}: {type(error).__name__}: {error}") from error
     return module
 
 
-def _line(path: Path, error: Exception) -> str:
+def line_in(path: str | Path, error: Exception) -> str:
     """Return the last line of a file that an error came through, as ` line N`."""
     if isinstance(error, SyntaxError):
         return f" line {error.lineno}"

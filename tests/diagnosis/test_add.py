@@ -7,7 +7,9 @@ import pytest
 
 from garat_jax import cli
 from garat_jax.diagnosis import load_model
+from garat_jax.diagnosis.add import Sized
 from garat_jax.diagnosis.hidden import make_recordings
+from garat_jax.effects import ViscousDamping
 from tests import models
 
 
@@ -56,6 +58,12 @@ def test_a_fitted_effect_is_recovered_and_said(pendulum, recorded, capsys):
     assert f"torque = {effect.torque:.4g} N m (95 %: " in printed
     before, after = printed.rpartition("spread: ")[2].split()[0:3:2]
     assert float(after) < 0.3 * float(before)
+
+
+@pytest.mark.parametrize(("after", "says_so"), [(0.1, False), (0.21, True)])
+def test_an_error_that_does_not_fall_is_said(after, says_so):
+    sized = Sized(ViscousDamping("joint/hinge"), {}, 1.0, 0.2, after)
+    assert ("it did not fall" in sized.change) == says_so
 
 
 def test_a_second_effect_keeps_the_first(pendulum):

@@ -10,11 +10,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from garat_jax.diagnosis import Recording, diagnose, load_model
+from garat_jax.diagnosis import Recording, compare, diagnose, load_model
 from garat_jax.diagnosis.convert import free_pendulum
 from garat_jax.diagnosis.diagnose import verdict_of
 from garat_jax.diagnosis.hidden import DRAWN, OUTSIDE, make_recordings
 from garat_jax.diagnosis.results import Errors
+from garat_jax.errors import UserError
 from garat_jax.runs import RunDirectory
 
 PENDULUM = Path(__file__).parents[2] / "envs" / "assets" / "pendulum.xml"
@@ -37,6 +38,7 @@ def check_found(hidden, found):
     assert found.verdict == "missing_effect"
     assert found.error.after < 1.25 * found.error.noise_floor < 0.5 * found.error.before
     assert found.ladder[0].error_holdout > found.ladder[-1].error_holdout
+    assert [rung.added for rung in found.ladder[1:]] == list(found.selected)
     if first.effect == hidden.kind:
         for name, value in first.parameters.items():
             assert value.estimate == pytest.approx(hidden.parameters[name], rel=0.05)
@@ -45,6 +47,32 @@ def check_found(hidden, found):
 @pytest.mark.parametrize("kind", ["coulomb_friction", "motor_gain"])
 def test_a_hidden_effect_is_found_and_sized(tmp_path, kind):
     check_found(*find(tmp_path, 20, kind, **FASTEST))
+
+
+@pytest.mark.parametrize(
+    ("recordings", "said"),
+    [
+        ([], "there are no recordings"),
+        ("run1.csv", "expected a list of recordings, not 'run1.csv' alone"),
+        (["run1.csv"], "expected recordings, not 'run1.csv'; Recording.read"),
+    ],
+)
+def test_what_is_no_recording_is_refused(recordings, said):
+    for use in (diagnose, compare):
+        with pytest.raises(UserError, match=said):
+            use(load_model(PENDULUM), recordings)
+
+
+def test_nothing_is_claimed_from_too_few_pieces(tmp_path):
+    made = make_recordings(
+        PENDULUM, tmp_path, 20, num_recordings=1, seconds=0.6, rate=125.0, kind="coulomb_friction"
+    )
+    model = load_model(PENDULUM)
+    (path,) = (*made.fit, *made.holdout)
+    found = diagnose(model, [Recording.read(path, model)])
+    assert found.verdict == "unexplained"
+    assert not found.selected and not found.drifts
+    assert found.sentence.startswith("Too little was recorded to be certain of what is missing")
 
 
 def test_a_clean_model_is_adequate(tmp_path):

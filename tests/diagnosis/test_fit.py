@@ -9,11 +9,11 @@ from scipy import signal
 
 from garat_jax.diagnosis.diagnose import make_candidates, split, thin
 from garat_jax.diagnosis.differences import clear_differences
-from garat_jax.diagnosis.fit import fit, promises_more
+from garat_jax.diagnosis.fit import are_determined, fit, interval, promises_more
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.problem import Problem, StartSpace
+from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels
 from garat_jax.diagnosis.screen import cosine, screen
 from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, metric_spread, signal_noise
 from garat_jax.diagnosis.simulate import Simulator
@@ -105,6 +105,16 @@ def test_a_fit_recovers_a_parameter_and_its_interval_covers_it():
     assert found.theta[free[0]] == pytest.approx(0.02, rel=0.02)
     assert found.low[0] < 0.02 < found.high[0]
     assert np.sqrt(np.mean(found.residual**2)) == pytest.approx(1.0, abs=0.25)
+
+
+def test_as_many_parameters_as_blocks_of_time_leave_no_interval():
+    problem = make_problem([record(UNIFORM[:60], damping=0.02)], candidates())
+    num_blocks = len(np.unique(block_labels(problem)[problem.fitted]))
+    assert not are_determined(problem, np.ones(num_blocks, bool))
+    assert are_determined(problem, np.ones(num_blocks - 1, bool))
+    found = fit(problem, problem.simulator.base, problem.segments.start, [])
+    low, high = interval(problem, found.theta, None, range(num_blocks), np.ones(num_blocks, bool))
+    assert not np.any(np.isfinite([low, high]))
 
 
 def test_estimates_are_what_a_timestep_of_zero_would_give():

@@ -7,7 +7,7 @@ import pytest
 
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Interval
-from garat_jax.diagnosis.judge import _at_end, is_certain, judge
+from garat_jax.diagnosis.judge import TOO_FEW, _at_end, is_certain, judge
 from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
@@ -82,6 +82,14 @@ def test_of_laws_that_both_reach_the_noise_the_simpler_counts(problem):
     assert (first.effect, second.effect) == (SIMPLE, RICH)
     assert [named.effect for named in first.indistinguishable_from] == [RICH]
     assert first.passes
+
+
+@pytest.mark.parametrize(("num_fitted", "passes"), [(3, True), (2, False)])
+def test_nothing_passes_where_too_few_segments_are_fitted(problem, num_fitted, passes):
+    fitted = problem.fitted & (np.cumsum(problem.fitted) <= num_fitted)
+    first, _ = judged(dataclasses.replace(problem, fitted=fitted), 0.7, 0.8)
+    assert first.passes == passes
+    assert passes or first.why == TOO_FEW
 
 
 @pytest.mark.parametrize(("left", "equals"), [(1.0, [RICH]), (1.3, [])])

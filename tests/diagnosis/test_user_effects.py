@@ -7,6 +7,7 @@ import pytest
 
 from garat_jax import cli
 from garat_jax.diagnosis import load_model
+from garat_jax.diagnosis.add import add
 from garat_jax.diagnosis.diagnose import make_candidates
 from garat_jax.diagnosis.view import repaired
 from garat_jax.effects.catalogue import load_catalogue
@@ -69,6 +70,25 @@ def test_it_is_added_listed_and_read_back(mine, capsys):
     assert "my bench" in capsys.readouterr().out
     assert cli.main(["export", str(out), "--out", str(out.with_suffix(".xml"))]) == 2
     assert "unknown effect 'my_spring'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("self.stifness", "my_effects.py line 23): AttributeError: 'Spring' object has no"),
+        (
+            "self.stiffness * jax.numpy.ones(7)",
+            "my_effects.py line 23): ValueError: Cannot",
+        ),
+    ],
+)
+def test_a_mistake_in_a_law_is_one_line_that_says_where(mine, wrong, said):
+    mine.write_text(MINE.replace("self.stiffness)", f"{wrong})"))
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    with pytest.raises(UserError) as caught:
+        add(model, "my_spring", "joint/hinge", {"stiffness": 1.0}).model.compile(engine="mujoco")
+    assert str(caught.value).startswith("effect my_spring (") and said in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

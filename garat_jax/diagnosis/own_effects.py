@@ -1,0 +1,54 @@
+"""A mistake in a user's own effect is one line that names the effect, its file and where in it."""
+
+import inspect
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+
+from garat_jax.dynamics import Dynamics, compile, initial_state, step
+from garat_jax.effects import CATALOGUE, Effect
+from garat_jax.effects.catalogue import line_in
+from garat_jax.errors import UserError
+from garat_jax.overrides import Override
+
+
+def is_own(effect: Effect) -> bool:
+    """Say whether an effect is none of the built-in catalogue."""
+    return type(effect) is not CATALOGUE.get(effect.kind)
+
+
+def compile_own(
+    spec, overrides: Sequence[Override], effects: Sequence[Effect], engine: str
+) -> Dynamics:
+    """Compile a model with effects of the user's own, each traced through one step.
+
+    Raises:
+        UserError: As `dynamics.compile`; or an own effect fails, in whatever way.
+    """
+    for effect in filter(is_own, effects):
+        try:
+            jax.eval_shape(_one_step, compile(spec, tuple(overrides), (effect,), engine))
+        except UserError:
+            raise
+        except Exception as error:
+            raise UserError(
+                f"effect {effect.kind}{_where(effect, error)}: {type(error).__name__}: "
+                f"{str(error).splitlines()[0] if str(error) else 'no message'}"
+            ) from error
+    return compile(spec, tuple(overrides), tuple(effects), engine)
+
+
+def _one_step(dynamics: Dynamics):
+    host = dynamics.host.model
+    state = initial_state(dynamics, jnp.asarray(host.qpos0), jnp.zeros(host.nv))
+    return step(dynamics, state, jnp.zeros(host.nu))
+
+
+def _where(effect: Effect, error: Exception) -> str:
+    """Return the file of an effect, and the last line of it that an error came through."""
+    try:
+        path = inspect.getfile(type(effect))
+    except (OSError, TypeError):  # written in a notebook
+        return ""
+    return f" ({path}{line_in(path, error)})"
