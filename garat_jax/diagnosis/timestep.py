@@ -42,7 +42,8 @@ LOST = 10.0
 """Cost of a segment, relative to noise's and to the median segment's, above which its initial state
 was not found."""
 GROUPS = 6
-"""Groups of segments, each fitted by itself, that say by how much fits across contacts scatter."""
+"""Groups of segments, each fitted by itself at the first finer timestep, that say by how much fits
+across contacts scatter."""
 SETTLED = 0.4
 """What a finer timestep changes, in half-widths of the interval, below which no still finer one is
 tried: a timestep of 0 changes a third of that."""
@@ -166,7 +167,7 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
     chosen = _chosen(problem)
     some, near = problem.take(chosen), fitted.take(chosen)
     coarse, change = _left(some, near), np.zeros(len(free))
-    half = half_before = (fitted.high - fitted.low)[excited] / 2
+    half = half_before = scatter = (fitted.high - fitted.low)[excited] / 2
     for number in range(REFINEMENTS):
         half_before = half
         some, before = _finer(some, near)
@@ -182,9 +183,11 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
         if _are_smooth(differences, _excited(near)):
             near, _ = converge(some, near, differences)
         change, half = (near.theta - before.theta)[free], (near.high - near.low) / 2
+        if number == 0:
+            scatter = _scatter(some, near, free)
         if np.all(np.abs(change) <= SETTLED * half):
             break
-    half = np.maximum.reduce([half, half_before, _scatter(some, near, free)])
+    half = np.maximum.reduce([half, half_before, scatter])
     is_told = np.isfinite(half)
     theta, low, high = fitted.theta.copy(), fitted.low.copy(), fitted.high.copy()
     theta[free[is_told]] = near.theta[free[is_told]]
@@ -215,8 +218,8 @@ def _scatter(problem: Problem, near: Fit, free: np.ndarray) -> np.ndarray:
         found.append(fitted.theta[free])
     if len(found) < 2:
         return np.zeros(len(free))
-    wide = stats.t.ppf(0.975, len(found) - 1)
-    return wide * np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
+    sure = stats.t.ppf(0.975, len(found) - 1)
+    return sure * np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
 
 
 def _left(problem: Problem, fitted: Fit) -> float:
