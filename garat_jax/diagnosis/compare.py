@@ -154,10 +154,11 @@ def compare(
         also: Other models to score beside it: repaired or grounded ones.
 
     Raises:
-        UserError: Another model has other joints or actuators.
+        UserError: Another model has other joints or actuators, or there are no recordings.
     """
     started = time.monotonic()
-    host, recordings = native_model(model.compile(engine="mujoco")), checked(recordings)
+    recordings = checked(recordings)
+    host = native_model(model.compile(engine="mujoco"))
     for other in also:
         theirs = other.compile(engine="mujoco").host.model
         check_same_machine(other.path, theirs, model.path, host)

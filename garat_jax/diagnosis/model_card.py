@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from garat_jax.diagnosis.own_effects import compile_own
+from garat_jax.diagnosis.own_effects import try_own
 from garat_jax.dynamics import Dynamics, Override, compile
 from garat_jax.effects import CATALOGUE, Effect
 from garat_jax.effects.base import element_names
@@ -60,8 +60,10 @@ class Model:
     interval: float | None = None
 
     def compile(self, engine: str = "auto", extra_effects: Sequence[Effect] = ()) -> Dynamics:
-        """Compile the model, with more effects after its own; see `compile_own`."""
-        return compile_own(self.spec, self.overrides, (*self.effects, *extra_effects), engine)
+        """Compile the model, with more effects after its own; see `dynamics.compile`."""
+        effects = (*self.effects, *extra_effects)
+        try_own(self.spec, self.overrides, effects)
+        return compile(self.spec, self.overrides, effects, engine)
 
     def world(self, task: Task, engine: str = "auto") -> World:
         """Return a task in this model, to train in: with its effects, and its action transformer.

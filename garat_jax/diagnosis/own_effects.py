@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import mujoco
 
 from garat_jax.dynamics import Dynamics, compile, initial_state, step
 from garat_jax.effects import CATALOGUE, Effect
@@ -18,25 +19,24 @@ def is_own(effect: Effect) -> bool:
     return type(effect) is not CATALOGUE.get(effect.kind)
 
 
-def compile_own(
-    spec, overrides: Sequence[Override], effects: Sequence[Effect], engine: str
-) -> Dynamics:
-    """Compile a model with effects of the user's own, each traced through one step.
+def try_own(
+    spec: mujoco.MjSpec, overrides: tuple[Override, ...], effects: Sequence[Effect]
+) -> None:
+    """Trace each effect of the user's own through one step of a model that has no other.
 
     Raises:
-        UserError: As `dynamics.compile`; or an own effect fails, in whatever way.
+        UserError: One fails, in whatever way.
     """
     for effect in filter(is_own, effects):
         try:
-            jax.eval_shape(_one_step, compile(spec, tuple(overrides), (effect,), engine))
+            jax.eval_shape(_one_step, compile(spec, overrides, (effect,), "mujoco"))
         except UserError:
-            raise
+            continue  # it may need another effect; compiling all of them says if it does not fit
         except Exception as error:
-            raise UserError(
-                f"effect {effect.kind}{_where(effect, error)}: {type(error).__name__}: "
-                f"{str(error).splitlines()[0] if str(error) else 'no message'}"
-            ) from error
-    return compile(spec, tuple(overrides), tuple(effects), engine)
+            said = str(error).partition("\n")[0]
+            where = _where(effect, error)
+            what = f"{type(error).__name__}: {said}"
+            raise UserError(f"effect {effect.kind}{where}: {what}") from error
 
 
 def _one_step(dynamics: Dynamics):

@@ -339,7 +339,7 @@ def _ranking(diagnosis: Diagnosis) -> list[Section]:
                 figures.ranking(diagnosis.candidates),
                 "By how much the held-out recordings' error falls if this effect alone is fitted, "
                 "and its 95 % interval; samples that the timestep makes hard to predict count less."
-                " Green: it passes every test. Grey: the table says why not. An arrow: beyond.",
+                " Green: passes every test. Grey: the table says why not. Arrow: beyond the edge.",
                 "What each effect would explain",
             )
         )
