@@ -1,10 +1,12 @@
-"""What is being done, on stderr: a line that changes on a terminal, elsewhere a line each."""
+"""What is being done and for how long, on stderr: one line on a terminal, elsewhere a line each."""
 
 import contextlib
 import sys
+import time
 from collections.abc import Callable, Iterator
 
 from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 
 def tell(message: str) -> None:
@@ -14,7 +16,7 @@ def tell(message: str) -> None:
 
 @contextlib.contextmanager
 def progress(first: str) -> Iterator[Callable[[str], None]]:
-    """Show what is being done as long as the block lasts.
+    """Show what is being done, and since when the block began, as long as it lasts.
 
     Args:
         first: What is done first.
@@ -24,8 +26,17 @@ def progress(first: str) -> Iterator[Callable[[str], None]]:
     """
     console = Console(stderr=True)
     if not console.is_terminal:
-        tell(first)
-        yield tell
+        began = time.monotonic()
+
+        def say(message: str) -> None:
+            seconds = int(time.monotonic() - began)
+            tell(f"{seconds // 60:3d}:{seconds % 60:02d} {message}")
+
+        say(first)
+        yield say
         return
-    with console.status(first) as status:
-        yield status.update
+    doing = TextColumn("{task.description}", markup=False)
+    columns = SpinnerColumn(), TimeElapsedColumn(), doing
+    with Progress(*columns, console=console, transient=True) as shown:
+        task = shown.add_task(first, total=None)
+        yield lambda message: shown.update(task, description=message)

@@ -137,6 +137,7 @@ def explain(
         before = settle(found.problem, found.problem.simulator.base, found.fit.start)
     problem, steps, current = found.problem, found.steps, found.fit
     if steps:
+        say("counting the timestep's share")
         current = settle_twice(problem, found.timeless or count_timestep(problem, current))
         steps[-1] = steps[-1]._replace(fit=current)
     shown = _as_shown(problem, steps, current)
@@ -205,7 +206,7 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         if steps and not is_above(problem, metric, current, floor):
             break
         held = [step.effect for step in steps]
-        say(f"scoring the candidates, round {number + 1}")
+        say(f"scoring the candidates, round {number + 1}{_beside(problem, held)}")
         judged = _round(problem, metric, current, held, floor, say, refinable=held)
         follow = functools.partial(_follow, problem, metric, held, say)
         judged, chosen = choose(problem, metric, current, judged, len(held), follow, say)
@@ -229,6 +230,13 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
             steps = refitted(problem, steps, current)
         timeless = added.timeless if current is added.fit else None
     return Selection(problem, steps, current, timeless, floor, first_round, best)
+
+
+def _beside(problem: Problem, held: Sequence[int]) -> str:
+    """Return a clause with the effects that were added, for those who wait."""
+    effects = [problem.simulator.effects[i] for i in held]
+    names = [f"{effect.kind} at {effect.target}" for effect in effects]
+    return f", beside {' and '.join(names)}" if names else ""
 
 
 def _round(
