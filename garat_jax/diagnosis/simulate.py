@@ -219,12 +219,12 @@ class Simulator:
         return UserError(f"no simulation with {named} stays finite, even at its nominal")
 
     def _ways(self, theta: np.ndarray, base: np.ndarray) -> dict[tuple[str, str], list[int]]:
-        """Sort rows by how their change is had, and by what moves unless that is at once."""
+        """Sort rows by how their change is had, and by what moves that looks at the state."""
         ways: dict[tuple[str, str], list[int]] = {}
         blind, memoryless = {*self._blind}, {*self._blind, *self._memoryless}
         for i, row in enumerate(theta):
             moved = {*self._owner[row != base].tolist()}
-            kinds = " ".join(sorted({self.effects[j].kind for j in moved}))
+            kinds = " ".join(sorted({self.effects[j].kind for j in moved - blind}))
             acting = {*self._acting(np.stack([base, row]))}
             if self._any_at_once and acting <= blind:
                 way = ("at once", "")
