@@ -8,7 +8,7 @@ as the cost falls as they promise.
 import numpy as np
 from scipy import optimize
 
-from garat_jax.diagnosis.differences import STEP, Differences, difference_steps, projected
+from garat_jax.diagnosis.differences import Differences, difference_steps, projected
 from garat_jax.diagnosis.problem import Linearisation, Problem, linearise
 from garat_jax.diagnosis.starts import (
     KEPT_PROMISE,
@@ -30,9 +30,9 @@ SHRINK = 10.0
 FIRST_SHRUNK = 1.0
 """Damping, relative to what the data say, after the first that is not: half the step."""
 STALLED = 4
-"""Steps in a row, taken or not, none of which lowers the cost by `LITTLE`, after which a fit with
-wider differences has converged, too: initial states promise for ever what jumps do not let them
-keep."""
+"""Steps in a row, taken or not, after which a fit has converged, too, if none lowers the cost by
+`LITTLE` or by `KEPT_PROMISE` of what it promised: initial states promise for ever what jumps do not
+let them keep."""
 LITTLE = 1e-3
 """Fall of the cost, relative to it."""
 MOST_DAMPED = 1e4
@@ -70,7 +70,6 @@ def descend(
         Parameters, initial states and the linearisation at them.
     """
     damping, undamped, stalled = 1e-4, np.zeros(len(start)), 0
-    patience = STALLED if np.any(near.relative > STEP) else STEPS
     lin, is_old = near.linearisation, np.full(len(start), is_stale)
     for taken in range(STEPS):
         change, _ = parameter_step(problem, theta, lin, free, damping)
@@ -79,7 +78,7 @@ def descend(
         before = np.sum(lin.residual**2, 1)
         promised = before - promised_costs(lin, expected, start_change)
         cost, promise = before[problem.fitted].sum(), promised[problem.fitted].sum()
-        if promise < min(FITTED * cost, least) or damping > MOST_DAMPED or stalled == patience:
+        if promise < min(FITTED * cost, least) or damping > MOST_DAMPED or stalled == STALLED:
             break
         if taken > 1 and cost - promise > BEATEN * rival:
             break
@@ -91,7 +90,7 @@ def descend(
         falls = before - np.sum(trial.residual**2, 1)
         fall = falls[problem.fitted].sum()
         missed = is_old & (promised > SETTLED * before) & (falls < KEPT_PROMISE * promised)
-        stalled = 0 if fall > LITTLE * cost else stalled + 1
+        stalled = 0 if fall > min(LITTLE * cost, KEPT_PROMISE * promise) else stalled + 1
         if fall > 0:
             theta, start, lin, damping = moved, starts, trial, damping / SHRINK
             is_old = np.ones(len(start), bool)

@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-from scipy import stats
 
 from garat_jax.diagnosis.differences import STEP, Differences, clear_differences, projected
 from garat_jax.diagnosis.fit import (
@@ -41,9 +40,6 @@ IN_A_ROW = 4
 LOST = 10.0
 """Cost of a segment, relative to noise's and to the median segment's, above which its initial state
 was not found."""
-GROUPS = 6
-"""Groups of segments, each fitted by itself at the first finer timestep, that say by how much fits
-across contacts scatter."""
 SETTLED = 0.4
 """What a finer timestep changes, in half-widths of the interval, below which no still finer one is
 tried: a timestep of 0 changes a third of that."""
@@ -65,14 +61,9 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     if not np.any(excited) or not are_determined(problem, excited):
         return fitted
     differences = clear_differences(problem, fitted.theta, fitted.start, fitted.free)
-    are_smooth = _are_smooth(differences, excited)
-    if not are_smooth and _is_coarse(problem, fitted):
+    if not _are_smooth(differences, excited) and _is_coarse(problem, fitted):
         return _at_finer_timesteps(problem, fitted)
-    if are_smooth:
-        fitted, lin = converge(problem, fitted, differences)
-        rough = np.zeros(len(fitted.free))
-    else:
-        fitted, lin, rough = _at_smooth_minimum(problem, fitted, differences)
+    fitted, lin, rough = _at_minimum(problem, fitted, differences)
     if moved := _extrapolated(problem, fitted, lin, rough):
         return moved
     if _is_coarse(problem, fitted):
@@ -99,20 +90,22 @@ def _is_coarse(problem: Problem, fitted: Fit) -> bool:
     return bool(np.sum(change[problem.fitted] ** 2) > np.sum(problem.expected[problem.fitted]))
 
 
-def _at_smooth_minimum(
+def _at_minimum(
     problem: Problem, fitted: Fit, differences: Differences
 ) -> tuple[Fit, Linearisation, np.ndarray]:
-    """Move a fit to the minimum of a smooth surface through its cost.
+    """Take a fit to its minimum; across contacts, to that of a smooth surface through its cost.
 
     Returns:
         The fit there, the linearisation, and how far parameters may be from there, [k].
     """
-    keep, lin = _excited(fitted), differences.linearisation
+    keep, lin, rough = _excited(fitted), differences.linearisation, np.zeros(len(fitted.free))
+    if _are_smooth(differences, keep) or not are_determined(problem, keep):
+        return *converge(problem, fitted, differences), rough
     if not np.all(differences.is_clear[keep]):
         relative = np.where(differences.is_clear, differences.relative, WIDE)
         lin = wide(problem, fitted, fitted.free, relative)
     covariance, sure = uncertainty(problem, lin, keep)
-    columns, rough = np.asarray(fitted.free)[keep], np.zeros(len(keep))
+    columns = np.asarray(fitted.free)[keep]
     fitted, rough[keep] = smooth_minimum(problem, fitted, columns, covariance, sure)
     return fitted, lin._replace(residual=fitted.residual), rough
 
@@ -157,17 +150,18 @@ def _extrapolated(
 def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
     """Return a fit as ever finer timesteps have it, until a timestep of 0 would hardly change it.
 
-    The integrator's error falls with the timestep. But contacts hold a fit back on its way: what
-    the last timestep changed may be to come once more, and counts as unsure. The noise is the same
-    at each, so that an interval that is narrower than at the timestep before is so by chance. Where
-    a finer timestep explains less, the estimates stay, and their intervals reach as far.
+    The integrator's error falls with the timestep. But contacts hold a fit back on its way, so that
+    each is taken to the middle of the dips around it, and what the last timestep changed may be to
+    come once more, and counts as unsure. The noise is the same at each: an interval that is
+    narrower than at the timestep before is so by chance. Where a finer timestep explains less, the
+    estimates stay, and their intervals reach as far.
     """
     excited = _excited(fitted)
     free = np.asarray(fitted.free)[excited]
     chosen = _chosen(problem)
     some, near = problem.take(chosen), fitted.take(chosen)
     coarse, change = _left(some, near), np.zeros(len(free))
-    half = half_before = scatter = (fitted.high - fitted.low)[excited] / 2
+    half = half_before = (fitted.high - fitted.low)[excited] / 2
     for number in range(REFINEMENTS):
         half_before = half
         some, before = _finer(some, near)
@@ -180,14 +174,12 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
             searches=number == 0,
         )
         differences = clear_differences(some, near.theta, near.start, free)
-        if _are_smooth(differences, _excited(near)):
-            near, _ = converge(some, near, differences)
-        change, half = (near.theta - before.theta)[free], (near.high - near.low) / 2
-        if number == 0:
-            scatter = _scatter(some, near, free)
+        near, _, rough = _at_minimum(some, near, differences)
+        change = (near.theta - before.theta)[free]
+        half = np.hypot((near.high - near.low) / 2, rough)
         if np.all(np.abs(change) <= SETTLED * half):
             break
-    half = np.maximum.reduce([half, half_before, scatter])
+    half = np.maximum(half, half_before)
     is_told = np.isfinite(half)
     theta, low, high = fitted.theta.copy(), fitted.low.copy(), fitted.high.copy()
     theta[free[is_told]] = near.theta[free[is_told]]
@@ -199,27 +191,6 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
         low, high = np.minimum(low, fitted.low), np.maximum(high, fitted.high)
         return dataclasses.replace(fitted, low=low, high=high)
     return dataclasses.replace(follow(problem, theta, fitted), low=low, high=high)
-
-
-def _scatter(problem: Problem, near: Fit, free: np.ndarray) -> np.ndarray:
-    """Return the free parameters' half-widths by how fits to groups of segments scatter, [k].
-
-    Across contacts a cost has many minima, which lie elsewhere for other segments: what derivatives
-    at one of them say of the noise is too little. Student's t of the groups' mean.
-    """
-    groups = np.arange(len(near.start)) // IN_A_ROW % GROUPS
-    found = []
-    for group in np.unique(groups):
-        chosen = np.flatnonzero(groups == group)
-        some, there = problem.take(chosen), near.take(chosen)
-        fitted = fit(
-            some, there.theta, there.start, free, sensitivity=there.sensitivity, searches=False
-        )
-        found.append(fitted.theta[free])
-    if len(found) < 2:
-        return np.zeros(len(free))
-    sure = stats.t.ppf(0.975, len(found) - 1)
-    return sure * np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
 
 
 def _left(problem: Problem, fitted: Fit) -> float:

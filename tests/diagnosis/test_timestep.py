@@ -83,21 +83,22 @@ def test_fits_at_the_whole_and_half_the_timestep_say_how_far_the_whole_is_from_n
     assert finer.low[0] < 0.02 < finer.high[0]
 
 
-def test_fits_to_groups_of_segments_say_by_how_much_they_scatter(monkeypatch):
-    recordings = [record(np.arange(2000) * 0.004, damping=0.02, seed=seed) for seed in range(2)]
-    problem = make_problem(recordings, [ViscousDamping("joint/hinge")], horizon=0.2)
-    found = converged(problem, np.array([0.02]))
-    offsets, sizes = iter([3e-4, -3e-4, 3e-4, -3e-4, 3e-4, -3e-4]), []
+def test_across_contacts_every_finer_fit_is_taken_to_the_middle_of_its_dips(monkeypatch):
+    problem, found = damped(noise=1e-3)
+    exact, asked = timestep._at_finer_timesteps(problem, found), []
+    off, rough = 1e-3, 5e-3
 
-    def moved(some, theta, start, free, **_):
-        sizes.append(len(start))
-        return dataclasses.replace(found, theta=theta + next(offsets))
+    def smoothed(some, near, columns, covariance, sure):
+        asked.append(some.simulator)
+        return follow(some, near.theta + off, near), np.array([rough])
 
-    monkeypatch.setattr(timestep, "fit", moved)
-    (half,) = timestep._scatter(problem, found, np.array([0]))
-    assert sum(sizes) == len(found.start) and len(sizes) == timestep.GROUPS
-    deviation = 3e-4 * np.sqrt(6 / 5)
-    assert half == pytest.approx(2.571 * deviation / np.sqrt(6), rel=1e-3)  # Student's t, 5 free
+    monkeypatch.setattr(timestep, "_are_smooth", lambda *_: False)
+    monkeypatch.setattr(timestep, "smooth_minimum", smoothed)
+    counted = timestep._at_finer_timesteps(problem, found)
+    assert asked[0] is problem.simulator.refined(timestep.REFINED)
+    assert counted.theta[0] == pytest.approx(exact.theta[0] + off, abs=0.3 * off)
+    assert counted.high[0] > counted.theta[0] + rough
+    assert counted.low[0] < counted.theta[0] - rough
 
 
 def test_segments_that_are_fitted_again_are_of_every_recording():
