@@ -38,11 +38,15 @@ class Figure:
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table; numbers among the cells are rounded and stand to the right."""
+    """A table; numbers among the cells are rounded and stand to the right.
+
+    If `folded` says what it holds, it is shown on a click on that.
+    """
 
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
     caption: str = ""
+    folded: str = ""
 
 
 @dataclasses.dataclass(frozen=True)

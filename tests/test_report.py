@@ -59,6 +59,16 @@ def test_numbers_in_tables_are_rounded_and_absent_ones_are_empty(tmp_path):
     assert '<td class="number"></td>' in page
 
 
+def test_a_folded_table_says_what_it_holds(tmp_path):
+    table = report.Table(("effect",), [("friction",)], folded="1 <more>")
+    section = report.Section("Others", tables=[table])
+    page = markup(write(tmp_path / "report.html", sections=[section]))
+    (inside,) = re.findall(
+        r"<details><summary>1 &lt;more&gt;</summary>(.*)</details>", page, flags=re.DOTALL
+    )
+    assert "friction" in inside
+
+
 def test_lists_and_paragraphs(tmp_path):
     page = write(tmp_path / "report.html")
     assert "<p>First paragraph.</p>" in page

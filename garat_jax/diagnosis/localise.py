@@ -26,6 +26,8 @@ SLOW = 0.25
 """Speed below which a joint counts as slow, relative to its root mean square."""
 MUCH = 0.5
 """Part of the largest commanded torque from which commands count as large."""
+BY_CONTACTS = "in proportion to the contacts"
+"""The regime of what the contacts give."""
 WORTH_TELLING = 0.05
 """Smallest share of the missing torque that a regime is told for."""
 
@@ -152,7 +154,7 @@ def _features(m: MissingTorque, dof: int):
     yield "when much is commanded", beyond, "", words
     yield "when the command changes", np.gradient(command), "", " of its change in a sample"
     yield "in proportion to the load", load, "", " of the model's own load torque"
-    yield "in proportion to the contacts", contact, "", " of the model's own contact torque"
+    yield BY_CONTACTS, contact, "", " of the model's own contact torque"
     inertial = m.acceleration[:, dof]
     yield "in proportion to acceleration", inertial, "kg m²", ", {sign} the acceleration"
     yield "with position", position - position.mean(), "N m/rad", ""

@@ -9,9 +9,8 @@ import numpy as np
 from garat_jax import report
 from garat_jax.diagnosis import figures
 from garat_jax.diagnosis.diagnose import split
-from garat_jax.diagnosis.figures import label, was_fitted, words
-from garat_jax.diagnosis.findings import Candidate, Estimate
-from garat_jax.diagnosis.localise import Place
+from garat_jax.diagnosis.figures import label
+from garat_jax.diagnosis.localise import BY_CONTACTS, Place
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.report_data import (
@@ -26,8 +25,12 @@ from garat_jax.diagnosis.report_data import (
     torque_section,
     unseen_section,
 )
+from garat_jax.diagnosis.report_effects import (
+    ladder_section,
+    parameters_section,
+    ranking_section,
+)
 from garat_jax.diagnosis.results import Diagnosis, Errors
-from garat_jax.diagnosis.units import after_number
 from garat_jax.diagnosis.view import View, look
 from garat_jax.report import Fact, Figure, Reproduce, Section, Table
 from garat_jax.runs import RunDirectory
@@ -39,6 +42,8 @@ NUM_WORST = 3
 """Segments that are shaded as the worst."""
 MOST_WARNINGS = 3
 """Warnings that follow the result."""
+MOST_PLACES = 6
+"""Patterns of the missing torque that are told."""
 NUM_SIGNALS = 4
 """Signals that are drawn, those with the largest relative error."""
 
@@ -142,10 +147,10 @@ def diagnosis_sections(
         _errors(diagnosis.decisive, view),
         traces(view),
         *([] if diagnosis.verdict == "adequate" else _where(diagnosis.where, view)),
-        *_ranking(diagnosis),
+        *ranking_section(diagnosis),
         *unseen_section(diagnosis.unseen),
-        *_ladder(diagnosis),
-        *_parameters(diagnosis, model),
+        *ladder_section(diagnosis),
+        *parameters_section(diagnosis, model),
         *conditions_section(diagnosis),
         *drift_section(diagnosis.drifts),
         *repeatability_section(diagnosis),
@@ -262,12 +267,13 @@ def traces(view: View) -> Section:
     sizes = [size.relative for size in before.sizes().values()]
     chosen = sorted(np.argsort(sizes)[::-1][:NUM_SIGNALS])
     seconds = before.horizon
+    segments = f"{len(worst)} segments" if len(worst) > 1 else "segment"
     drawn = [
         Figure(
             figures.traces(recording, index, int(i), before, after, worst),
             f"Above, {before.names[i]} as measured in {recording.name} and as simulated; every "
             f"{seconds:g} s the simulation starts anew. Below, simulated minus measured. Shaded: "
-            f"the {len(worst)} segments in which the model as it is does worst.",
+            f"the {segments} in which the model as it is does worst.",
             before.names[i],
         )
         for i in chosen
@@ -285,7 +291,14 @@ def _where(places: Sequence[Place], view: View) -> list[Section]:
     law = ""
     if view.explained is not None:
         law = " The line is what the repaired model gives by the same computation."
-    evidence = "\n".join(f"- {place.evidence}" for place in places[:6])
+    told = places[:MOST_PLACES]
+    evidence = "\n".join(f"- {place.evidence}" for place in told)
+    if any(place.regime == BY_CONTACTS for place in told):
+        evidence += (
+            "\n\nThe torque of a contact follows from how deep the bodies press into each other, "
+            "which the noise of measured positions changes by much: read that line as a sign that "
+            "something is off while in contact, not of how much."
+        )
     return [
         Section(
             "Where it fails",
@@ -315,86 +328,3 @@ def _where(places: Sequence[Place], view: View) -> list[Section]:
             ],
         ),
     ]
-
-
-def _ranking(diagnosis: Diagnosis) -> list[Section]:
-    if not diagnosis.candidates:
-        return []
-    rows = [
-        (
-            label(c),
-            "; ".join(_estimate(name, e) for name, e in c.parameters.items() if was_fitted(c)),
-            round(100 * c.share),
-            100 * c.error_after if was_fitted(c) else None,
-            round(100 * c.stability) if was_fitted(c) else None,
-            c.why + _alike(c),
-        )
-        for c in diagnosis.candidates
-    ]
-    columns = ["effect", "size", "share [%]", "error [%]", "stable [%]", "verdict"]
-    drawn = []
-    if any(map(was_fitted, diagnosis.candidates)):
-        drawn.append(
-            Figure(
-                figures.ranking(diagnosis.candidates),
-                "By how much the held-out recordings' error falls if this effect alone is fitted, "
-                "and its 95 % interval; samples that the timestep makes hard to predict count less."
-                " Green: passes every test. Grey: the table says why not. Arrow: beyond the edge.",
-                "What each effect would explain",
-            )
-        )
-    return [
-        Section(
-            "Which effects could explain it",
-            "Every effect of the catalogue was tried wherever it can act: where a part has a name "
-            "and what it needs, as flexibility needs a joint's armature, friction a geom that can "
-            "touch another. Only one is added that explains much, lowers the error on recordings "
-            "it was not fitted to, leads over all others for certain and has a possible sign.",
-            figures=drawn,
-            tables=[
-                Table(
-                    columns,
-                    rows,
-                    "Share: of the fitted recordings' squared error that it explains. Error: on "
-                    "held-out recordings once it is fitted; effects without one were ruled out "
-                    "before. Of what was added, both are those of the round in which it was, and "
-                    "the size is that of the final fit. Stable: how often it, or one that looks "
-                    "like it, comes out first when the recordings are resampled.",
-                )
-            ],
-        )
-    ]
-
-
-def _alike(candidate: Candidate) -> str:
-    """Return a clause with the effects that the recordings cannot tell from a candidate."""
-    names = [f"{words(n.effect)} at {n.target}" for n in candidate.indistinguishable_from]
-    return f"; these recordings cannot tell it from {' or '.join(names)}" if names else ""
-
-
-def _ladder(diagnosis: Diagnosis) -> list[Section]:
-    if len(diagnosis.ladder) < 2:
-        return []
-    text = "Each step adds one effect and fits all of them again to the recordings fitted."
-    caption = "The error after each step. Only the blue line, on held-out recordings, is proof."
-    return [Section("The error falls", text, figures=[Figure(figures.ladder(diagnosis), caption)])]
-
-
-def _parameters(diagnosis: Diagnosis, model: Model) -> list[Section]:
-    if not diagnosis.selected:
-        return []
-    rows = [
-        (label(c), name, e.estimate, e.low, e.high, e.unit)
-        for c in diagnosis.selected
-        for name, e in c.parameters.items()
-    ]
-    kinds = dict.fromkeys(c.effect for c in diagnosis.selected)
-    laws = "\n".join(f"- {words(kind)}: {model.catalogue[kind].law}" for kind in kinds)
-    columns = ["effect", "parameter", "estimate", "low", "high", "unit"]
-    caption = "Estimates and their 95 % intervals; – where the recordings say nothing."
-    return [Section("What was added", laws, tables=[Table(columns, rows, caption)])]
-
-
-def _estimate(name: str, e: Estimate) -> str:
-    ends = f" ({e.low:.3g} to {e.high:.3g})" if np.isfinite([e.low, e.high]).all() else ""
-    return f"{name} {e.estimate:.3g}{ends}{after_number(e.unit)}"

@@ -11,7 +11,7 @@ from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named, a
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD
 from garat_jax.diagnosis.leftover import leftover
-from garat_jax.diagnosis.localise import Place
+from garat_jax.diagnosis.localise import BY_CONTACTS, Place
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.report import (
     diagnosis_facts,
@@ -192,10 +192,19 @@ def test_page_of_a_missing_effect_has_every_part(tmp_path):
     assert f"The model lacks {named} cannot tell)." in page
     assert "torque 0.06 (0.055 to 0.065) N m" in page
     assert "these recordings cannot tell it from viscous damping at joint/hinge" in page
+    folded = page.partition("<summary>1 effect ruled out before a fit</summary>")[2]
+    assert "others explain more" in folded.partition("</details>")[0]
     assert "Swing at two amplitudes." in page
     assert "recording_1.csv, in which the model as it is does worst" in page
     assert "garat diagnose pendulum.xml" in page
     assert "nan" not in page.lower().replace("name", "")
+
+
+@pytest.mark.parametrize("regime", [BY_CONTACTS, "at any speed"])
+def test_what_noise_does_to_contacts_is_said_where_they_are_told(tmp_path, regime):
+    place = Place("hinge", 0.8, regime, "80 % of it is at hinge")
+    page = write(tmp_path, dataclasses.replace(MISSING, where=(place,)))
+    assert ("noise of measured positions changes by much" in page) is (regime == BY_CONTACTS)
 
 
 def test_one_hopeless_effect_does_not_flatten_the_others():
