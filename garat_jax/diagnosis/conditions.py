@@ -220,9 +220,17 @@ def _fit_together(
         dataclasses.replace(c, parameters=estimates(problem, number, best))
         for number, c in enumerate(candidates)
     )
-    return [
-        dataclasses.replace(d, selected=tuple(next(refined) for _ in d.selected)) for d in diagnoses
-    ]
+    return [_with_selected(d, tuple(next(refined) for _ in d.selected)) for d in diagnoses]
+
+
+def _with_selected(diagnosis: Diagnosis, selected: tuple[Candidate, ...]) -> Diagnosis:
+    """Return a diagnosis with other sizes of what was selected, in its ladder too."""
+    sized = {candidate.named: candidate for candidate in selected}
+    ladder = tuple(
+        rung if rung.added is None else dataclasses.replace(rung, added=sized[rung.added.named])
+        for rung in diagnosis.ladder
+    )
+    return dataclasses.replace(diagnosis, selected=selected, ladder=ladder)
 
 
 def _is_fitted(candidate: Candidate, parameter: str) -> bool:

@@ -8,7 +8,7 @@ as the cost falls as they promise.
 import numpy as np
 from scipy import optimize
 
-from garat_jax.diagnosis.differences import Differences, difference_steps, projected
+from garat_jax.diagnosis.differences import STEP, Differences, difference_steps, projected
 from garat_jax.diagnosis.problem import Linearisation, Problem, linearise
 from garat_jax.diagnosis.starts import (
     KEPT_PROMISE,
@@ -30,9 +30,9 @@ SHRINK = 10.0
 FIRST_SHRUNK = 1.0
 """Damping, relative to what the data say, after the first that is not: half the step."""
 STALLED = 4
-"""Steps in a row, taken or not, after which a fit has converged, too, if none lowers the cost by
-`LITTLE` or by `KEPT_PROMISE` of what it promised: initial states promise for ever what jumps do not
-let them keep."""
+"""Steps in a row, taken or not, after which a fit with wider differences has converged, too, if
+none lowers the cost by `LITTLE` or by `KEPT_PROMISE` of its promise: initial states promise for
+ever what jumps do not let them keep. With small differences twice as many, for damping to grow."""
 LITTLE = 1e-3
 """Fall of the cost, relative to it."""
 MOST_DAMPED = 1e4
@@ -70,6 +70,7 @@ def descend(
         Parameters, initial states and the linearisation at them.
     """
     damping, undamped, stalled = 1e-4, np.zeros(len(start)), 0
+    patience = STALLED if np.any(near.relative > STEP) else 2 * STALLED
     lin, is_old = near.linearisation, np.full(len(start), is_stale)
     for taken in range(STEPS):
         change, _ = parameter_step(problem, theta, lin, free, damping)
@@ -78,7 +79,7 @@ def descend(
         before = np.sum(lin.residual**2, 1)
         promised = before - promised_costs(lin, expected, start_change)
         cost, promise = before[problem.fitted].sum(), promised[problem.fitted].sum()
-        if promise < min(FITTED * cost, least) or damping > MOST_DAMPED or stalled == STALLED:
+        if promise < min(FITTED * cost, least) or damping > MOST_DAMPED or stalled == patience:
             break
         if taken > 1 and cost - promise > BEATEN * rival:
             break

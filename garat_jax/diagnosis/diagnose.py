@@ -20,7 +20,7 @@ from garat_jax.diagnosis.horizon import (
     say_horizon,
     warn_of_divergence,
 )
-from garat_jax.diagnosis.judge import FEWEST_SEGMENTS, SMALLEST_SHARE
+from garat_jax.diagnosis.judge import FEWEST_SEGMENTS, SMALLEST_SHARE, is_enough
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, checked
@@ -189,13 +189,15 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
 
 def few_segments(problem: Problem) -> tuple[str, ...]:
     """Say that too little was recorded to be certain of anything; nothing where it suffices."""
-    num = int(problem.fitted.sum())
-    if num >= FEWEST_SEGMENTS:
+    num_fitted, num_held_out = (int(some.sum()) for some in (problem.fitted, ~problem.fitted))
+    if is_enough(problem):
         return ()
+    is_fitted = num_fitted < FEWEST_SEGMENTS
+    num = num_fitted if is_fitted else num_held_out
     pieces = f"{num} piece" + "s" * (num != 1)
     return (
-        f"only {pieces} of {problem.horizon:.2g} s could be fitted, too few to be certain of an "
-        "effect or of an interval; record for longer",
+        f"only {pieces} of {problem.horizon:.2g} s could be {'fitted' if is_fitted else 'held out'}"
+        ", too few to be certain of an effect or of an interval; record for longer",
     )
 
 

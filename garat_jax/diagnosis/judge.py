@@ -24,7 +24,7 @@ NEGLIGIBLE = 0.01
 """Part of the fall of the held-out error by which a resample may rise: one without any moment at
 which the effect acts shows next to no change."""
 FEWEST_SEGMENTS = 3
-"""Fitted segments below which nothing is certain."""
+"""Fitted segments, and blocks of time held out, below which nothing is certain."""
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 ROUNDING = 1e-9
@@ -161,8 +161,9 @@ def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, al
             lead = -np.inf
     gain = held_out_gain(problem, metric, current, contender.fit)
     share = 1.0 - contender.fit.cost[problem.fitted].sum() / current.cost[problem.fitted].sum()
-    is_enough = problem.fitted.sum() >= FEWEST_SEGMENTS
-    why = _failed_gate(contender.score, share, gain, lead, stability) if is_enough else TOO_FEW
+    why = TOO_FEW
+    if is_enough(problem):
+        why = _failed_gate(contender.score, share, gain, lead, stability)
     effects = problem.simulator.effects
     named = [effects[contenders[i].score.effect] for i in alike]
     candidate = Candidate(
@@ -179,6 +180,12 @@ def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, al
         why=why or "passes every gate",
     )
     return candidate, contender
+
+
+def is_enough(problem: Problem) -> bool:
+    """Say whether there is enough, fitted and held out, to be certain of anything."""
+    num_held_out = len(np.unique(block_labels(problem)[~problem.fitted]))
+    return min(int(problem.fitted.sum()), num_held_out) >= FEWEST_SEGMENTS
 
 
 def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stability: float) -> str:

@@ -7,7 +7,7 @@ ball and free joints add `.0 .1 ...`. SI units.
 
 import dataclasses
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -105,14 +105,15 @@ class Recording:
         return dataclasses.replace(recording, warnings=(*warnings, *oddities(recording, model)))
 
 
-def checked(recordings: Sequence[Recording], least: int = 1) -> Sequence[Recording]:
-    """Return recordings as they are if that is what they are, and at least so many.
+def checked(recordings: Iterable[Recording], least: int = 1) -> tuple[Recording, ...]:
+    """Return recordings if that is what they are, and at least so many.
 
     Raises:
         UserError: They are something else, as a path or a single recording is, or too few.
     """
     if isinstance(recordings, Recording | str | Path):
         raise UserError(f"expected a list of recordings, not {recordings!r} alone; write [...]")
+    recordings = tuple(recordings)
     for recording in recordings:
         if not isinstance(recording, Recording):
             raise UserError(

@@ -18,6 +18,7 @@ from garat_jax.diagnosis.own_effects import try_own
 from garat_jax.dynamics import Dynamics, Override, compile
 from garat_jax.effects import CATALOGUE, Effect
 from garat_jax.effects.base import element_names
+from garat_jax.effects.bounds import check_bounds
 from garat_jax.effects.catalogue import Catalogue, load_catalogue
 from garat_jax.env import Task, TaskEnv, Transform, World
 from garat_jax.errors import UserError, unknown_name
@@ -123,12 +124,11 @@ def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
     """
     path = Path(path)
     catalogue = load_catalogue() if catalogue is None else catalogue
-    if path.suffix.lower() == ".xml":
-        return Model(path.stem, path, path, load_spec(path), catalogue=catalogue)
-    if path.suffix.lower() != ".toml":
+    suffix = path.suffix.lower()
+    if suffix not in (".xml", ".toml"):
         raise UserError(f"{path}: expected an MJCF file (.xml) or a model card (.toml)")
-    card = _read_toml(path)
-    mjcf = _mjcf_of(path, card)
+    card = _read_toml(path) if suffix == ".toml" else {}
+    mjcf = _mjcf_of(path, card) if suffix == ".toml" else path
     spec = load_spec(mjcf)
     try:
         overrides = tuple(_override(table) for table in _tables(card, "override"))
@@ -136,6 +136,7 @@ def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
         host = compile(spec, overrides, engine="mujoco").host.model
         for effect in effects:
             effect.check(host)
+            check_bounds(effect, host)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     return Model(path.stem, path, mjcf, spec, overrides, effects, catalogue)

@@ -1,4 +1,4 @@
-"""What is being done and for how long, on stderr: one line on a terminal, elsewhere a line each."""
+"""What is being done and since when, on stderr: one line on a terminal, elsewhere a line each."""
 
 import contextlib
 import sys

@@ -235,7 +235,7 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
 def _beside(problem: Problem, held: Sequence[int]) -> str:
     """Return a clause with the effects that were added, for those who wait."""
     effects = [problem.simulator.effects[i] for i in held]
-    names = [f"{effect.kind} at {effect.target}" for effect in effects]
+    names = [str(Named(effect.kind, effect.target)) for effect in effects]
     return f", beside {' and '.join(names)}" if names else ""
 
 

@@ -99,13 +99,19 @@ def _at_minimum(
         The fit there, the linearisation, and how far parameters may be from there, [k].
     """
     keep, lin, rough = _excited(fitted), differences.linearisation, np.zeros(len(fitted.free))
-    if _are_smooth(differences, keep) or not are_determined(problem, keep):
+    if not are_determined(problem, keep):
+        return fitted, lin, rough
+    if _are_smooth(differences, keep):
         return *converge(problem, fitted, differences), rough
     if not np.all(differences.is_clear[keep]):
         relative = np.where(differences.is_clear, differences.relative, WIDE)
         lin = wide(problem, fitted, fitted.free, relative)
     covariance, sure = uncertainty(problem, lin, keep)
-    columns = np.asarray(fitted.free)[keep]
+    shows = np.diag(covariance) > 0.0  # not so one that no difference moves, as below a threshold
+    if not np.any(shows):
+        return fitted, lin, rough
+    keep[keep] = shows
+    columns, covariance = np.asarray(fitted.free)[keep], covariance[np.ix_(shows, shows)]
     fitted, rough[keep] = smooth_minimum(problem, fitted, columns, covariance, sure)
     return fitted, lin._replace(residual=fitted.residual), rough
 

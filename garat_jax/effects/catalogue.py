@@ -3,6 +3,7 @@
 import importlib.metadata
 import importlib.util
 import inspect
+import os
 import sys
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
@@ -77,7 +78,8 @@ def line_in(path: str | Path, error: Exception) -> str:
     """Return the last line of a file that an error came through, as ` line N`."""
     if isinstance(error, SyntaxError):
         return f" line {error.lineno}"
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
+    whole = os.path.abspath(path)  # as importlib names it
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == whole]
     return f" line {frames[-1].lineno}" if frames else ""
 
 
