@@ -77,6 +77,8 @@ def measure(pair: str, arguments: Arguments) -> dict[str, Any]:
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
     stages = [(float(held), float(way)) for held, way in STAGE.findall(done.stderr)]
+    if not stages:
+        raise RuntimeError(f"{' '.join(command)} did not print what its stages need")
     row = {
         "pair": pair,
         "method": arguments.method,

@@ -68,6 +68,8 @@ def test_all_conditions_size_a_shared_effect_and_each_sizes_its_own():
     assert payload.parameters["z"].estimate == pytest.approx(-0.4, abs=0.01)
     shared = found.selected[0].parameters["coefficient"]
     assert shared.low < 0.02 < shared.high
+    for one in (found, found.conditions["loaded"]):
+        assert [rung.added for rung in one.ladder] == [None, *one.selected]
 
 
 def test_a_shared_payload_may_be_heavier_under_a_condition():

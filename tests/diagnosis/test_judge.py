@@ -7,7 +7,7 @@ import pytest
 
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Interval
-from garat_jax.diagnosis.judge import TOO_FEW, _at_end, is_certain, judge
+from garat_jax.diagnosis.judge import FEWEST_SEGMENTS, TOO_FEW, _at_end, is_certain, judge
 from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
@@ -90,6 +90,15 @@ def test_nothing_passes_where_too_few_segments_are_fitted(problem, num_fitted, p
     first, _ = judged(dataclasses.replace(problem, fitted=fitted), 0.7, 0.8)
     assert first.passes == passes
     assert passes or first.why == TOO_FEW
+
+
+def test_nothing_passes_where_a_moment_is_held_out(problem):
+    held_out = np.flatnonzero(~problem.fitted)
+    kept = np.union1d(np.flatnonzero(problem.fitted), held_out[:1])
+    first, _ = judged(problem.take(kept), 0.7, 0.8)
+    num_blocks = len(np.unique(problem.blocks()))
+    assert num_blocks < FEWEST_SEGMENTS
+    assert first.why == TOO_FEW
 
 
 @pytest.mark.parametrize(("left", "equals"), [(1.0, [RICH]), (1.3, [])])

@@ -15,7 +15,13 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import Override, native_model
-from garat_jax.effects import Effect, MotorGain
+from garat_jax.effects import (
+    Effect,
+    MotorGain,
+    StribeckFriction,
+    TorqueOffset,
+    ViscousDamping,
+)
 from garat_jax.effects.base import ModelView
 from garat_jax.effects.transmission import Transmission
 from garat_jax.errors import UserError
@@ -82,6 +88,25 @@ def test_a_candidate_that_does_nothing_predicts_what_the_model_does_without_it(m
         theta[j] += HARDLY * p.scale * (-1 if theta[j] >= p.high else 1)
         beside = simulator.predict(theta[None], segments.start[None], segments)[0]
         assert np.abs(beside - alone).max() < 1e-5, (effect.kind, effect.target)
+
+
+def test_beside_a_law_that_looks_what_does_not_look_shares_a_program():
+    blind = (
+        MotorGain("actuator/shoulder"),
+        ViscousDamping("joint/elbow"),
+        TorqueOffset("joint/elbow"),
+    )
+    simulator, segments = make_simulator(models.ARM, (StribeckFriction("joint/elbow"), *blind))
+    base = simulator.base.copy()
+    base[[j for j, slot in enumerate(simulator.slots) if slot.effect == 0]] = 0.3
+    firsts = [next(j for j, s in enumerate(simulator.slots) if s.effect == i) for i in (1, 2, 3)]
+    thetas = np.tile(base, (3, 1))
+    thetas[np.arange(3), firsts] += 0.05
+    assert [len(rows) for rows in simulator._ways(thetas, base).values()] == [3]
+    together = simulator.linear_change(thetas, base, segments.start, segments)
+    alone = [simulator.linear_change(t[None], base, segments.start, segments)[0] for t in thetas]
+    assert np.abs(together).max(axis=(1, 2, 3)).min() > 1e-4
+    assert np.abs(together - np.stack(alone)).max() < 1e-9
 
 
 def test_an_effect_that_breaks_the_model_at_its_nominal_is_named():

@@ -15,7 +15,7 @@ from garat_jax.diagnosis.metric import Floor
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.starts import follow, settle
 from garat_jax.diagnosis.timestep import count_timestep
-from garat_jax.effects import CoggingTorque, ContactFriction, ViscousDamping
+from garat_jax.effects import CoggingTorque, ContactFriction, TorqueOffset, ViscousDamping
 from tests.diagnosis import pendulum, test_contact
 from tests.diagnosis.test_fit import UNIFORM, make_problem, record
 from tests.diagnosis.test_starts import FRICTION, problem_of
@@ -97,8 +97,22 @@ def test_across_contacts_every_finer_fit_is_taken_to_the_middle_of_its_dips(monk
     counted = timestep._at_finer_timesteps(problem, found)
     assert asked[0] is problem.simulator.refined(timestep.REFINED)
     assert counted.theta[0] == pytest.approx(exact.theta[0] + off, abs=0.3 * off)
+    assert exact.high[0] < exact.theta[0] + 0.5 * rough
     assert counted.high[0] > counted.theta[0] + rough
     assert counted.low[0] < counted.theta[0] - rough
+
+
+def test_a_parameter_that_no_difference_moves_is_left_out_of_the_surface(monkeypatch):
+    recordings = [record(UNIFORM, damping=0.02, noise=1e-3)]
+    laws = [ViscousDamping("joint/hinge"), TorqueOffset("joint/hinge")]
+    problem = make_problem(recordings, laws)
+    found = fit(problem, np.array([0.02, 0.0]), problem.segments.start, (0, 1))
+    differences = clear_differences(problem, found.theta, found.start, found.free)
+    differences.linearisation.parameters[..., 1] = 0.0
+    monkeypatch.setattr(timestep, "_are_smooth", lambda *_: False)
+    near, _, rough = timestep._at_minimum(problem, found, differences)
+    assert near.theta[1] == found.theta[1] and rough[1] == 0.0
+    assert np.all(np.isfinite(rough)) and abs(near.theta[0] - 0.02) < 2e-3
 
 
 def test_segments_that_are_fitted_again_are_of_every_recording():

@@ -114,6 +114,13 @@ def test_a_bad_file_is_one_line(mine, capsys, old, new, said):
     assert str(mine) in line
 
 
+def test_a_relative_path_has_its_line_too(mine, monkeypatch):
+    mine.write_text(MINE.replace("import jax\n", "import jaxx\n", 1))
+    monkeypatch.chdir(mine.parent)
+    with pytest.raises(UserError, match=rf"^{mine.name} line 3: ModuleNotFoundError"):
+        load_catalogue([mine.name])
+
+
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(UserError, match="there is no file"):
         load_catalogue([tmp_path / "absent.py"])
