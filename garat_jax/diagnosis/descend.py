@@ -38,7 +38,8 @@ LITTLE = 1e-3
 MOST_DAMPED = 1e4
 """Damping, relative to what the data say, from which a fit makes no further step."""
 BEATEN = 2.0
-"""Cost, relative to another fit's, above which a fit is not worth its last steps."""
+"""Cost, relative to another fit's, above which a fit that has stalled goes no further. One that
+still falls may surprise: where things stick and slip, costs fall by more than steps promise."""
 
 
 def descend(
@@ -81,7 +82,7 @@ def descend(
         cost, promise = before[problem.fitted].sum(), promised[problem.fitted].sum()
         if promise < min(FITTED * cost, least) or damping > MOST_DAMPED or stalled == patience:
             break
-        if taken > 1 and cost - promise > BEATEN * rival:
+        if taken > 1 and stalled and cost - promise > BEATEN * rival:
             break
         moved = theta.copy()
         moved[list(free)] += change

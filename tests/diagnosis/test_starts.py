@@ -25,9 +25,12 @@ FRICTION = 0.35
 @pytest.fixture(scope="module")
 def puck() -> Problem:
     """Return a problem whose noise is larger than the engine's error at its timestep."""
-    model = Model("puck", __file__, __file__, mujoco.MjSpec.from_string(test_contact.PUCK))
     recordings = [test_contact.record(FRICTION, 0, noise=10.0)]
-    return problem_of(model, recordings, ContactFriction("geom/puck"), {"sliding": 0.5})
+    return problem_of(puck_model(), recordings, ContactFriction("geom/puck"), {"sliding": 0.5})
+
+
+def puck_model() -> Model:
+    return Model("puck", __file__, __file__, mujoco.MjSpec.from_string(test_contact.PUCK))
 
 
 def problem_of(model: Model, recordings, effect, start: Mapping[str, float]) -> Problem:
@@ -89,6 +92,15 @@ def test_friction_of_a_contact_is_fitted_from_afar_with_an_interval(puck, first)
     assert 1e-3 < found.high[0] - found.low[0] < 0.02
     true = settle(puck, np.array([FRICTION]), puck.segments.start)
     assert found.cost.sum() < 1.1 * true.cost.sum()
+
+
+def test_a_rival_that_fits_better_does_not_stop_a_fit_that_still_falls():
+    recordings = [test_contact.record(FRICTION, 3)]
+    law = ContactFriction("geom/puck")
+    problem = problem_of(puck_model(), recordings, law, {"sliding": 0.5})
+    far = settle(problem, np.array([0.8]), problem.segments.start)
+    beside = fit(problem, far.theta, far.start, (0,), rival=problem.expected.sum())
+    assert beside.theta[0] == pytest.approx(FRICTION, rel=0.01)
 
 
 def test_old_derivatives_by_initial_states_lead_to_the_same_fit(puck):
