@@ -7,13 +7,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from garat_jax.diagnosis import descend
 from garat_jax.diagnosis.contend import Contender, fit_further
-from garat_jax.diagnosis.differences import is_erratic, typical_size
+from garat_jax.diagnosis.differences import clear_differences, is_erratic, typical_size
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem, linearise
 from garat_jax.diagnosis.screen import Score
-from garat_jax.diagnosis.simulate import columns_of
+from garat_jax.diagnosis.simulate import Simulator, columns_of
 from garat_jax.diagnosis.starts import measured_anew, settle, settle_anew, settle_twice
 from garat_jax.effects import AsymmetricFriction, ContactFriction
 from tests.diagnosis import pendulum, test_contact
@@ -101,6 +102,31 @@ def test_a_rival_that_fits_better_does_not_stop_a_fit_that_still_falls():
     far = settle(problem, np.array([0.8]), problem.segments.start)
     beside = fit(problem, far.theta, far.start, (0,), rival=problem.expected.sum())
     assert beside.theta[0] == pytest.approx(FRICTION, rel=0.01)
+
+
+def test_steps_end_where_jumps_keep_nothing_of_what_they_promise(monkeypatch):
+    law = ContactFriction("geom/puck")
+    recordings = [test_contact.record(FRICTION, 1)]
+    problem = problem_of(puck_model(), recordings, law, {"sliding": 0.5})
+    near = settle(problem, np.array([0.36]), problem.segments.start)
+    differences = clear_differences(problem, near.theta, near.start, (0,))
+    calls, predict = [], Simulator.predict
+
+    def counted(self, *arguments):
+        calls.append(1)
+        return predict(self, *arguments)
+
+    def descended():
+        calls.clear()
+        how = problem, (0,), np.inf, near.theta, near.start, differences, False
+        return descend.descend(*how)[0], len(calls)
+
+    monkeypatch.setattr(Simulator, "predict", counted)
+    theta, few = descended()
+    monkeypatch.setattr(descend, "STALLED", descend.STEPS)
+    patient, many = descended()
+    assert few < 0.5 * many
+    assert theta[0] == pytest.approx(patient[0], rel=1e-3)
 
 
 def test_old_derivatives_by_initial_states_lead_to_the_same_fit(puck):
