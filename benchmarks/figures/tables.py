@@ -157,6 +157,29 @@ def hidden_effects(seed: int) -> str:
     return table(columns, lines) + text + commits(result["rows"]) + origin(name, result)
 
 
+def hidden_effects_before(seeds: tuple[int, ...]) -> str:
+    """One row a measure and one column a seed, with where each came from."""
+    results = {seed: read(f"hidden_effects_seed_{seed}") for seed in seeds}
+    shares = [
+        {line["measure"]: line for line in result["table"] if line.get("interval") is not None}
+        for result in results.values()
+    ]
+    rows = [
+        (
+            measure,
+            *(f"{100 * of[measure]['value']:.0f} % of {of[measure]['count']}" for of in shares),
+        )
+        for measure in shares[0]
+    ]
+    sets = [f"{result['sample']} of {result['cases']}" for result in results.values()]
+    columns = ("measure", *(f"seed {seed}" for seed in seeds))
+    origins = [
+        origin(f"hidden_effects_seed_{seed}", result) + commits(result["rows"])
+        for seed, result in results.items()
+    ]
+    return table(columns, [*rows, ("sets of recordings", *sets)]) + "".join(origins)
+
+
 def timing() -> str:
     """One row a set: what each tool took and found; mujoco.sysid is told what to fit."""
     result = read("hidden_effects_timing")
@@ -306,10 +329,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "fidelity": fidelity,
     "optimisation_level": optimisation_level,
     "profiling_clock": profiling_clock,
-    "hidden_effects_seed_4": functools.partial(hidden_effects, 4),
-    "hidden_effects_seed_5": functools.partial(hidden_effects, 5),
-    "hidden_effects_seed_6": functools.partial(hidden_effects, 6),
-    "hidden_effects_seed_7": functools.partial(hidden_effects, 7),
+    "hidden_effects": functools.partial(hidden_effects, 8),
+    "hidden_effects_before": functools.partial(hidden_effects_before, (7, 6, 5, 4)),
     "timing": timing,
     "real_data": real_data,
     "ground": ground,
