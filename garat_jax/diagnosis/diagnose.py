@@ -189,15 +189,15 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
 
 def few_segments(problem: Problem) -> tuple[str, ...]:
     """Say that too little was recorded to be certain of anything; nothing where it suffices."""
-    num_fitted, num_held_out = (int(some.sum()) for some in (problem.fitted, ~problem.fitted))
     if is_enough(problem):
         return ()
-    is_fitted = num_fitted < FEWEST_SEGMENTS
-    num = num_fitted if is_fitted else num_held_out
+    num, how = int(problem.fitted.sum()), "fitted"
+    if num >= FEWEST_SEGMENTS:
+        num, how = int((~problem.fitted).sum()), "held out"
     pieces = f"{num} piece" + "s" * (num != 1)
     return (
-        f"only {pieces} of {problem.horizon:.2g} s could be {'fitted' if is_fitted else 'held out'}"
-        ", too few to be certain of an effect or of an interval; record for longer",
+        f"only {pieces} of {problem.horizon:.2g} s could be {how}, too few to be certain of an "
+        "effect or of an interval; record for longer",
     )
 
 
