@@ -15,6 +15,7 @@ def enable() -> None:
     processes that this one starts too. Those that are set already stay as they are: FOLDER names
     another folder or, if empty, none; SWITCH=false switches the cache off.
     """
+    os.environ.setdefault(SHORTEST, "0")  # the second start of a run compiles nothing
     if FOLDER in os.environ:
         return
     try:
@@ -23,7 +24,6 @@ def enable() -> None:
     except (OSError, RuntimeError):  # no home, or none that can be written to
         return
     os.environ[FOLDER] = str(folder)
-    os.environ.setdefault(SHORTEST, "0")  # the second start of a run compiles nothing
 
 
 def folder() -> Path | None:

@@ -31,8 +31,15 @@ def test_another_folder_or_none_is_respected(name, monkeypatch, tmp_path):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", name)
     compilation_cache.enable()
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == name
+    assert os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] == "0"
     assert str(compilation_cache.folder() or "") == name
     assert list(tmp_path.iterdir()) == []
+
+
+def test_how_long_a_program_compiles_that_is_kept_stays_as_it_was_set(monkeypatch):
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "5")
+    compilation_cache.enable()
+    assert os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] == "5"
 
 
 def test_jax_can_be_told_to_use_none(monkeypatch):
