@@ -5,11 +5,13 @@ Wald test of what is left beside a common delay, offsets of the sensors and the 
 with blocks of time as the independent units (Liang and Zeger 1986).
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
 from garat_jax.diagnosis.differences import clear_differences
+from garat_jax.diagnosis.metric import timestep_error
 from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels, tall
 from garat_jax.diagnosis.robust import orthonormal, wald_test, without
 from garat_jax.diagnosis.simulate import Simulator, columns_of
@@ -45,7 +47,8 @@ class Evidence:
         self._free = orthonormal(tall(self._space.remove(lin.parameters)))
         self._labels = block_labels(problem).ravel()
         self.residual = self.rest(lin.residual[None])[:, 0]
-        integrator = problem.integrator_error(fit.theta, start, lin.residual)
+        here = dataclasses.replace(fit.take(chosen), residual=lin.residual)
+        integrator = timestep_error(problem, here)
         nuisances = self.rest(np.stack([integrator, *_offsets(problem)]))
         self._integrator, self._offsets = nuisances[:, :1], nuisances[:, 1:]
         self._delay = self._common_delay(fit.free)

@@ -8,6 +8,7 @@ import numpy as np
 from garat_jax.diagnosis.problem import AnyProblem, Problem, StartSpace
 from garat_jax.diagnosis.segments import metric_spread
 from garat_jax.diagnosis.starts import Fit
+from garat_jax.effects.contact import can_any_touch
 
 ABOVE_FLOOR = 1.5
 """A model is adequate up to this multiple of the noise floor."""
@@ -15,6 +16,8 @@ AT_FLOOR = 1.1
 """Multiple of the noise floor up to which a fit leaves nothing for another law to explain."""
 TRUSTED = 3.0
 """Standard deviations of noise that the timestep's error may reach before a sample counts less."""
+FINE = 8
+"""Physics substeps in place of each that say the timestep's error past contacts."""
 
 
 class Metric(NamedTuple):
@@ -87,23 +90,42 @@ def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
         settled: The model, as it is or with what was found, initial states fitted.
     """
     segments = problem.segments
-    shape = segments.measured.shape
-    sizes = [np.abs(x).reshape(shape) for x in timestep_error(problem, settled)]
-    size = np.maximum.accumulate(np.minimum(*sizes), axis=1)
-    trust = 1.0 / np.maximum(1.0, size / TRUSTED)
+    change = coarse_error(problem, settled)
+    sizes = change, StartSpace(settled.sensitivity).remove(change[..., None])[..., 0]
+    size = np.minimum(*(np.abs(x).reshape(segments.measured.shape) for x in sizes))
+    trust = 1.0 / np.maximum(1.0, np.maximum.accumulate(size, axis=1) / TRUSTED)
     return dataclasses.replace(problem, segments=dataclasses.replace(segments, trust=trust))
 
 
-def timestep_error(problem: Problem, current: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Return the engine's error at the model's timestep, whole and what no initial state undoes.
+def coarse_error(problem: Problem, current: Fit) -> np.ndarray:
+    """Return the engine's error at the model's timestep, as half of it tells.
 
-    A first-order integrator errs by twice what half a step changes.
+    A first-order integrator errs by twice what half a step changes. Past contacts that is too much:
+    those that open or close a step earlier change as much as they err.
 
     Returns:
-        Whitened, each [S, N].
+        Whitened, [S, N].
     """
-    change = 2.0 * problem.integrator_error(current.theta, current.start, current.residual)
-    return change, StartSpace(current.sensitivity).remove(change[..., None])[..., 0]
+    return 2.0 * problem.integrator_error(current.theta, current.start, current.residual)
+
+
+def timestep_error(problem: Problem, current: Fit) -> np.ndarray:
+    """Return the engine's error at the model's timestep that no initial state undoes.
+
+    Where geoms can touch, much finer steps say it in segments where it is above the noise; see
+    `coarse_error`.
+
+    Returns:
+        Whitened, [S, N].
+    """
+    theta, start, residual = current.theta, current.start, current.residual
+    change = coarse_error(problem, current)
+    loud = np.flatnonzero(np.abs(change).max(axis=1) > 1.0)
+    if len(loud) and can_any_touch(problem.simulator.host):
+        finer = problem.simulator.refined(FINE)
+        fine = problem.take(loud).residual_by(finer, theta, start[loud])
+        change[loud] = FINE / (FINE - 1) * (fine - residual[loud])
+    return StartSpace(current.sensitivity).remove(change[..., None])[..., 0]
 
 
 class Floor(NamedTuple):
@@ -123,7 +145,7 @@ class Floor(NamedTuple):
 def noise_floor(problem: Problem, metric: Metric, current: Fit) -> Floor:
     """Estimate the noise floor."""
     held_out = ~problem.fitted
-    _, change = timestep_error(problem, current)
+    change = timestep_error(problem, current)
     return Floor(
         float(np.hypot(metric.of_noise(held_out), metric.error(change, held_out))),
         np.hypot(1.0, metric.by_signal(change, held_out)),

@@ -194,6 +194,12 @@ class ContactCompliance(ContactEffect):
         return (weight * first + other * second) / (weight + other)
 
 
+def can_any_touch(host: mujoco.MjModel) -> bool:
+    """Say whether any two geoms can touch."""
+    disabled = host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return bool(host.npair and not disabled) or any(partners(host, g) for g in range(host.ngeom))
+
+
 def partners(host: mujoco.MjModel, geom: int) -> list[int]:
     """Return the geoms that a geom can touch by MuJoCo's rules, without those named in pairs."""
     if host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:

@@ -11,9 +11,10 @@ from garat_jax.diagnosis import timestep
 from garat_jax.diagnosis.differences import clear_differences
 from garat_jax.diagnosis.fit import converge, fit
 from garat_jax.diagnosis.held_out import warn_of_timestep
-from garat_jax.diagnosis.metric import Floor
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.metric import Floor, make_metric, noise_floor, trusted
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.starts import follow, settle
+from garat_jax.diagnosis.starts import follow, settle, settle_twice
 from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.effects import CoggingTorque, ContactFriction, TorqueOffset, ViscousDamping
 from tests.diagnosis import pendulum, test_contact
@@ -193,3 +194,58 @@ def test_a_signal_that_was_not_held_out_is_not_warned_of():
     assert warn_of_timestep(problem, floor, host) == ()
     (warning,) = warn_of_timestep(problem, floor._replace(rms=np.array([np.hypot(1, 4), 2])), host)
     assert "the engine's own error is 4 times the noise of qpos.hinge" in warning
+
+
+BALL = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom name="ground" type="plane" size="5 5 0.1"/>
+    <body name="ball" pos="0 0 0.06">
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom name="ball" type="sphere" size="0.05" mass="1" solref="0.02 0.2"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="lift" joint="z" ctrlrange="-20 20" ctrllimited="true"/></actuator>
+</mujoco>
+"""
+
+
+def bounced(seed: int) -> Recording:
+    """Lift a ball and let it bounce, at a 32nd of its model's timestep."""
+    rng = np.random.default_rng(seed)
+    spec = mujoco.MjSpec.from_string(BALL)
+    spec.option.timestep /= 32
+    model = spec.compile()
+    data, states = mujoco.MjData(model), []
+    ctrl = np.repeat(rng.uniform(-10, 17, 100), 10)
+    for command in ctrl:
+        states.append([*data.qpos, *data.qvel])
+        data.ctrl[0] = command
+        mujoco.mj_step(model, data, 32)
+    states = np.asarray(states) + rng.normal(size=(1000, 2)) * [1e-4, 2e-3]
+    return Recording(
+        name=f"bounced {seed}",
+        time=np.arange(1000) * 0.004,
+        qpos=states[:, :1],
+        qvel=states[:, 1:],
+        ctrl=ctrl[:, None],
+        torque={},
+        velocity_measured=True,
+        spans=((0, 1000),),
+        warnings=(),
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_where_a_ball_bounces_the_noise_floor_is_near_what_the_true_model_leaves(seed):
+    model = Model("ball", Path(__file__), Path(__file__), mujoco.MjSpec.from_string(BALL))
+    problem = make_problem([bounced(seed)], (), horizon=0.2, model=model, timestep=0.004)
+    problem = dataclasses.replace(problem, fitted=np.arange(len(problem.fitted)) % 2 > 0)
+    theta = problem.simulator.base
+    problem = trusted(problem, settle(problem, theta, problem.segments.start))
+    settled = settle_twice(problem, settle(problem, theta, problem.segments.start))
+    metric, held_out = make_metric(problem), ~problem.fitted
+    left = metric.error(settled.residual, held_out)
+    assert left > 4 * metric.of_noise(held_out)
+    assert noise_floor(problem, metric, settled).error == pytest.approx(left, rel=0.25)

@@ -8,7 +8,7 @@ import pytest
 
 from garat_jax import dynamics
 from garat_jax.effects import ContactCompliance, ContactFriction
-from garat_jax.effects.contact import partners
+from garat_jax.effects.contact import can_any_touch, partners
 from garat_jax.errors import UserError
 from tests.models import ARM, SLIDER, TUMBLER, spec
 
@@ -33,6 +33,14 @@ def test_the_pairs_that_are_named_are_those_that_mujoco_would_make():
     assert not ContactFriction.targets(spec(ARM).compile())
     with pytest.raises(UserError, match="can touch another"):
         ContactFriction("geom/upper_arm").check(spec(ARM).compile())
+
+
+def test_where_no_contact_can_be_nothing_can_touch():
+    assert can_any_touch(spec(PAIRED).compile())
+    assert not can_any_touch(spec(ARM).compile())
+    disabled = spec(PAIRED)
+    disabled.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    assert not can_any_touch(disabled.compile())
 
 
 def test_no_effect_is_what_the_model_has():
