@@ -22,8 +22,8 @@ from garat_jax.diagnosis.timestep import count_timestep
 CONTENDERS = 4
 """How many candidates are fitted each round; see `fit_contenders`."""
 FIRM = 2.0
-"""Half-widths of its 95 % interval by which a parameter that screening left out must differ from no
-effect, at a timestep of 0, to be fitted in the end."""
+"""Half-widths of its 95 % interval by which a parameter must differ from no effect, at a timestep
+of 0, to be fitted in the end: one that screening left out, or some one of an effect's."""
 LIKELY = 0.02
 """Share of the residual that a candidate must be expected to explain to be fitted."""
 HOPELESS = 8.0
@@ -234,12 +234,15 @@ def fit_further(
 def complete(problem: Problem, best: Contender, say: Callable[[str], None]) -> Contender:
     """Return a contender with those further parameters of its law that are firmly not nil.
 
-    However little such a parameter explains, without it the others make up for it.
+    However little such a parameter explains, without it the others make up for it. Those that are
+    firmly nil at the model's timestep are not asked again at a timestep of 0.
     """
     for fuller in fit_further(problem, best, say):
-        timeless = count_timestep(problem, fuller.fit)
         further = [j for j in fuller.fit.free if j not in best.fit.free]
-        nil = [j for j in further if not _is_firm(problem, timeless, j)]
+        if not any(is_firm(problem, fuller.fit, j) for j in further):
+            continue
+        timeless = count_timestep(problem, fuller.fit)
+        nil = [j for j in further if not is_firm(problem, timeless, j)]
         if not nil:
             return dataclasses.replace(fuller, timeless=timeless)
         if len(nil) < len(further):
@@ -247,8 +250,8 @@ def complete(problem: Problem, best: Contender, say: Callable[[str], None]) -> C
     return best
 
 
-def _is_firm(problem: Problem, fitted: Fit, column: int) -> bool:
-    """Say whether a fitted parameter differs from no effect by far."""
+def is_firm(problem: Problem, fitted: Fit, column: int) -> bool:
+    """Say whether a fitted parameter differs from no effect by far; see `FIRM`."""
     place = fitted.free.index(column)
     half = 0.5 * (fitted.high[place] - fitted.low[place])
     off = abs(fitted.theta[column] - problem.simulator.base[column])

@@ -43,12 +43,14 @@ from garat_jax.diagnosis.rivals import fill_out, refine
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle, settle_twice
-from garat_jax.diagnosis.steps import Step, prune, reconsider, refitted
+from garat_jax.diagnosis.steps import Step, fit_only, is_nil, prune, reconsider, refitted
 from garat_jax.diagnosis.timestep import count_timestep
 
 ROUNDS = 5
 FOLLOWED = 2
 """Candidates that are fitted beside each rival that is followed for one more effect."""
+NIL = "at a timestep of 0 its size is not told from none"
+"""Why one that passed every gate is not added."""
 AS_GOOD = "as good as what was added, beside what else was found"
 """Why a candidate that failed a gate by itself is no worse in the end."""
 
@@ -136,16 +138,18 @@ def explain(
         found, adequate = further, False
         before = settle(found.problem, found.problem.simulator.base, found.fit.start)
     problem, steps, current = found.problem, found.steps, found.fit
-    if steps:
-        say("counting the timestep's share")
-        current = settle_twice(problem, found.timeless or count_timestep(problem, current))
-        steps[-1] = steps[-1]._replace(fit=current)
-    shown = _as_shown(problem, steps, current)
+    steps, current = _counted(problem, steps, current, found.timeless, say)
+    nil = [step for step in found.steps if step.effect not in {s.effect for s in steps}]
+    floor = found.floor
+    if nil:
+        current = current if steps else before
+        floor = noise_floor(problem, make_metric(problem), current)
+    shown = _as_nil(nil) | _as_shown(problem, steps, current)
     selected = apart([shown[step.candidate.named] for step in steps])
     shown |= {c.named: c for c in selected}
     candidates = tuple(shown.get(c.named, c) for c in candidates)
     best = current if steps else found.best
-    if not is_above(problem, make_metric(problem), current, found.floor):
+    if not is_above(problem, make_metric(problem), current, floor):
         best = None
     return Outcome(
         problem,
@@ -154,10 +158,45 @@ def explain(
         _without_superfluous(candidates, selected),
         tuple(steps),
         selected,
-        found.floor,
+        floor,
         adequate and not steps,
         best,
     )
+
+
+def _counted(
+    problem: Problem, steps: Sequence[Step], current: Fit, timeless: Fit | None, say
+) -> tuple[list[Step], Fit]:
+    """Count the timestep's share of what was found; drop what is not told from no effect then.
+
+    The integrator's error may look like a small effect that passes every gate.
+
+    Args:
+        problem: What is fitted.
+        steps: The effects added.
+        current: The fit with all of them.
+        timeless: The same counted to a timestep of 0, if that is known already.
+        say: Told what is being done.
+
+    Returns:
+        The steps that are left, and the fit with their effects at a timestep of 0.
+    """
+    steps = list(steps)
+    while steps:
+        say("counting the timestep's share")
+        counted = settle_twice(problem, timeless or count_timestep(problem, current))
+        kept = [step for step in steps if not is_nil(problem, step.effect, counted)]
+        if len(kept) == len(steps):
+            return [*steps[:-1], steps[-1]._replace(fit=counted)], counted
+        current, timeless = fit_only(problem, current, [step.effect for step in kept]), None
+        steps = refitted(problem, kept, current) if kept else []
+    return steps, current
+
+
+def _as_nil(steps: Sequence[Step]) -> dict[Named, Candidate]:
+    """Return effects that a timestep of 0 does not need, and what did the same, as not passing."""
+    named = [c for step in steps for c in (step.candidate, *(other for other, _ in step.alike))]
+    return {c.named: dataclasses.replace(c, passes=False, why=NIL) for c in named}
 
 
 def _on_longer(

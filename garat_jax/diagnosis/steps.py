@@ -15,6 +15,7 @@ from garat_jax.diagnosis.contend import (
     as_refined,
     complete,
     fit_one,
+    is_firm,
     refines,
     under_another_name,
     with_evidence,
@@ -99,7 +100,7 @@ def _without(problem: Problem, current: Fit, others: list[Step], step: Step):
 def refitted(problem: Problem, steps: list[Step], current: Fit) -> list[Step]:
     """Return steps with the fits that now lead to the current one."""
     effects = [step.effect for step in steps]
-    fits = [_fit_only(problem, current, effects[:n]) for n in range(1, len(steps))]
+    fits = [fit_only(problem, current, effects[:n]) for n in range(1, len(steps))]
     return [step._replace(fit=f) for step, f in zip(steps, (*fits, current), strict=True)]
 
 
@@ -142,7 +143,7 @@ def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others
         What was fitted, judged beside the step's own effect.
     """
     say(f"looking for what would explain more than {step.candidate.named}")
-    without = _fit_only(problem, fitted, others)
+    without = fit_only(problem, fitted, others)
     scores = screen(problem, without, others)
     tried = {step.effect, *(contender.score.effect for _, contender in step.alike)}
     known = [score for score in scores if score.effect in tried]
@@ -206,10 +207,21 @@ def _fit_instead(problem: Problem, current: Fit, others: Sequence[int], instead:
     return fit(problem, theta, current.start, free, rival=rival, sensitivity=current.sensitivity)
 
 
-def _fit_only(problem: Problem, current: Fit, effects: Sequence[int]) -> Fit:
+def fit_only(problem: Problem, current: Fit, effects: Sequence[int]) -> Fit:
     """Fit again with some of the selected effects, the others back at no effect."""
     theta, free = _only(problem, current, effects)
     return fit(problem, theta, current.start, free, sensitivity=current.sensitivity)
+
+
+def is_nil(problem: Problem, effect: int, fitted: Fit) -> bool:
+    """Say whether no fitted parameter of an effect differs firmly from no effect.
+
+    Not so where an interval has no end: then the recordings do not say.
+    """
+    columns = {*columns_of(problem.simulator.slots, effect).values()} - {*fitted.frozen}
+    places = [i for i, j in enumerate(fitted.free) if j in columns]
+    have_ends = bool(np.all(np.isfinite([fitted.low[places], fitted.high[places]])))
+    return have_ends and not any(is_firm(problem, fitted, fitted.free[i]) for i in places)
 
 
 def _only(problem: Problem, current: Fit, effects: Sequence[int]) -> tuple[np.ndarray, list[int]]:

@@ -15,12 +15,12 @@ from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.names import renamed
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import AS_GOOD, _as_shown
+from garat_jax.diagnosis.rank import AS_GOOD, NIL, _as_nil, _as_shown, _counted
 from garat_jax.diagnosis.screen import Score, screen
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
-from garat_jax.diagnosis.steps import Step, prune, reconsider
+from garat_jax.diagnosis.steps import Step, is_nil, prune, reconsider
 from garat_jax.effects import (
     AsymmetricFriction,
     BackEmf,
@@ -217,3 +217,51 @@ def test_a_law_goes_where_one_that_refines_it_can_do_what_both_do():
     assert found["coulomb_negative"] == pytest.approx(0.0, abs=0.008)
     assert found["viscous_positive"] == pytest.approx(DAMPED, rel=0.1)
     assert found["viscous_negative"] == pytest.approx(DAMPED, rel=0.1)
+
+
+def quiet(line: str) -> None:
+    pass
+
+
+def test_an_effect_whose_size_may_be_none_at_a_timestep_of_0_is_dropped(problem):
+    every = (DAMPING, OFFSET, GAIN)  # the gain is that of the model
+    added = fit_with(problem, *every)
+    steps = [Step(candidate(effect), contender(problem, effect), added, []) for effect in every]
+    left, counted = _counted(problem, steps, added, None, quiet)
+    assert [step.effect for step in left] == [DAMPING, OFFSET]
+    assert left[-1].fit is counted
+    assert counted.free == (DAMPING, OFFSET)
+    assert counted.theta[DAMPING] == pytest.approx(DAMPED, rel=0.05)
+    assert counted.theta[GAIN] == 1.0
+
+
+def test_where_nothing_is_left_the_model_stays_as_it_is():
+    recordings = [record(lambda spec: None, seed) for seed in range(2)]
+    grid = choose_grid(recordings, 0.002)
+    simulator = Simulator(MODEL, EFFECTS, grid)
+    _, segments = choose_horizon(simulator, recordings, grid)
+    clean = Problem(simulator, segments, segments.recording == 0, 0.004)
+    step = Step(candidate(OFFSET), contender(clean, OFFSET), fit_with(clean, OFFSET), [])
+    left, counted = _counted(clean, [step], step.fit, None, quiet)
+    assert left == []
+    np.testing.assert_array_equal(counted.theta, simulator.base)
+
+
+def test_an_interval_without_an_end_says_nothing_of_no_effect(problem):
+    found = fit_with(problem, OFFSET)
+    size = np.abs(found.theta[[OFFSET]])
+
+    def within(half):
+        return dataclasses.replace(found, low=size - half * size, high=size + half * size)
+
+    assert is_nil(problem, OFFSET, within(0.6))
+    assert not is_nil(problem, OFFSET, within(0.4))
+    assert not is_nil(problem, OFFSET, within(np.inf))
+
+
+def test_what_is_dropped_does_not_pass_and_neither_does_what_did_the_same(problem):
+    own, other = candidate(OFFSET), candidate(GAIN)
+    step = Step(own, contender(problem, OFFSET), fit_with(problem, OFFSET), [(other, None)])
+    shown = _as_nil([step])
+    assert {*shown} == {own.named, other.named}
+    assert all(not c.passes and c.why == NIL for c in shown.values())
