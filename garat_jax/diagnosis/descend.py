@@ -86,15 +86,16 @@ def descend(
             break
         moved = theta.copy()
         moved[list(free)] += change
-        steps = difference_steps(problem, moved, free, near.relative)
         starts = start + start_change * problem.segments.start_unit
-        starts, trial = _tried(problem, moved, free, steps, start, starts, lin)
-        falls = before - np.sum(trial.residual**2, 1)
+        starts, residual = _tried(problem, moved, start, starts, before)
+        falls = before - np.sum(residual**2, 1)
         fall = falls[problem.fitted].sum()
         missed = is_old & (promised > SETTLED * before) & (falls < KEPT_PROMISE * promised)
         stalled = 0 if fall > min(LITTLE * cost, KEPT_PROMISE * promise) else stalled + 1
         if fall > 0:
-            theta, start, lin, damping = moved, starts, trial, damping / SHRINK
+            theta, start, damping = moved, starts, damping / SHRINK
+            steps = difference_steps(problem, theta, free, near.relative)
+            lin = linearise(problem, theta, start, free, steps, lin.start, residual)
             is_old = np.ones(len(start), bool)
         elif not np.any(missed & problem.fitted):
             damping = max(damping * SHRINK, FIRST_SHRUNK)
@@ -103,34 +104,30 @@ def descend(
     return theta, start, lin
 
 
-def _tried(problem: Problem, theta, free, steps, stay, move, lin: Linearisation):
-    """Linearise where initial states move, or stay in segments that move for the worse.
+def _tried(problem: Problem, theta, stay, move, before: np.ndarray):
+    """Simulate where initial states move, or stay in segments that move for the worse.
 
     Args:
         problem: What is fitted.
         theta: Parameters, [num_parameters].
-        free: Indices of the parameters to perturb.
-        steps: Their perturbations.
         stay: Initial states before the step, [S, nq + nv].
         move: Those after it.
-        lin: The linearisation before the step.
+        before: Each segment's cost before the step, [S].
 
     Returns:
-        Initial states, [S, nq + nv], and the linearisation there.
+        Initial states, [S, nq + nv], and the residual there, [S, N].
     """
-    trial = linearise(problem, theta, move, free, steps, lin.start)
-    cost = np.sum(trial.residual**2, 1)
-    worse = np.flatnonzero(cost > np.sum(lin.residual**2, 1))
+    simulator, starts = problem.simulator, move.copy()
+    residual = problem.residual_by(simulator, theta, move)
+    cost = np.sum(residual**2, 1)
+    worse = np.flatnonzero(cost > before)
     if not len(worse):
-        return move, trial
-    some, near = problem.take(worse), lin.start[worse]
-    stayed = linearise(some, theta, stay[worse], free, steps, near)
-    better = np.sum(stayed.residual**2, 1) < cost[worse]
-    chosen, start, residual = worse[better], move.copy(), trial.residual.copy()
-    parameters = trial.parameters.copy()
-    start[chosen], residual[chosen] = stay[chosen], stayed.residual[better]
-    parameters[chosen] = stayed.parameters[better]
-    return start, Linearisation(residual, parameters, trial.start)
+        return starts, residual
+    stayed = problem.take(worse).residual_by(simulator, theta, stay[worse])
+    better = np.sum(stayed**2, 1) < cost[worse]
+    chosen = worse[better]
+    starts[chosen], residual[chosen] = stay[chosen], stayed[better]
+    return starts, residual
 
 
 def excited(problem: Problem, free, sensitivity: np.ndarray) -> np.ndarray:
