@@ -23,7 +23,8 @@ CONTENDERS = 4
 """How many candidates are fitted each round; see `fit_contenders`."""
 FIRM = 2.0
 """Half-widths of its 95 % interval by which a parameter must differ from no effect, at a timestep
-of 0, to be fitted in the end: one that screening left out, or some one of an effect's."""
+of 0, to be fitted in the end: one that screening left out, or the only one of an effect. One half-
+width is too few among some hundred candidates."""
 LIKELY = 0.02
 """Share of the residual that a candidate must be expected to explain to be fitted."""
 HOPELESS = 8.0
@@ -232,17 +233,17 @@ def fit_further(
 
 
 def complete(problem: Problem, best: Contender, say: Callable[[str], None]) -> Contender:
-    """Return a contender with those further parameters of its law that are firmly not nil.
+    """Return a contender with those further parameters that firmly differ from no effect.
 
-    However little such a parameter explains, without it the others make up for it. Those that are
-    firmly nil at the model's timestep are not asked again at a timestep of 0.
+    However little such a parameter explains, without it the others make up for it.
     """
     for fuller in fit_further(problem, best, say):
         further = [j for j in fuller.fit.free if j not in best.fit.free]
-        if not any(is_firm(problem, fuller.fit, j) for j in further):
+        firm = [j for j in further if is_firm(problem, fuller.fit, j)]
+        if not firm:
             continue
         timeless = count_timestep(problem, fuller.fit)
-        nil = [j for j in further if not is_firm(problem, timeless, j)]
+        nil = [j for j in further if j not in firm or not is_firm(problem, timeless, j)]
         if not nil:
             return dataclasses.replace(fuller, timeless=timeless)
         if len(nil) < len(further):
@@ -252,10 +253,15 @@ def complete(problem: Problem, best: Contender, say: Callable[[str], None]) -> C
 
 def is_firm(problem: Problem, fitted: Fit, column: int) -> bool:
     """Say whether a fitted parameter differs from no effect by far; see `FIRM`."""
+    return firmness(problem, fitted, column) > FIRM
+
+
+def firmness(problem: Problem, fitted: Fit, column: int) -> float:
+    """Return by how many half-widths of its interval a fitted parameter differs from no effect."""
     place = fitted.free.index(column)
-    half = 0.5 * (fitted.high[place] - fitted.low[place])
-    off = abs(fitted.theta[column] - problem.simulator.base[column])
-    return bool(off > FIRM * half)
+    half = 0.5 * float(fitted.high[place] - fitted.low[place])
+    off = abs(float(fitted.theta[column] - problem.simulator.base[column]))
+    return off / max(half, 1e-300)
 
 
 def _without(problem: Problem, fuller: Contender, columns: Sequence[int]) -> Contender:

@@ -27,7 +27,7 @@ from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import Outcome, explain
+from garat_jax.diagnosis.rank import NIL, Outcome, explain
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import SHORTEST, choose_grid
 from garat_jax.diagnosis.separate import next_experiment
@@ -91,6 +91,7 @@ def diagnose(
     if not error.is_too_coarse:
         warnings += warn_of_timestep(problem, outcome.floor, host)
     longest = longest_errors(problem, outcome.after.theta, everything, grid, host, how)
+    first = [c for c in outcome.candidates[:1] if c.why != NIL]
     explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
     found = Diagnosis(
         model=str(model.path),
@@ -108,7 +109,7 @@ def diagnose(
         drifts=find_drifts(problem, outcome.best, everything)
         if outcome.best and not too_few
         else (),
-        next_experiment=next_experiment((*outcome.selected, *outcome.candidates[:1]), host),
+        next_experiment=next_experiment((*outcome.selected, *first), host),
         warnings=warnings,
         unseen=unseen(problem, outcome.before, explaining),
         still=is_still(problem.segments),

@@ -91,7 +91,7 @@ def trusted(problem: AnyProblem, settled: Fit) -> AnyProblem:
     """
     segments = problem.segments
     change = coarse_error(problem, settled)
-    sizes = change, StartSpace(settled.sensitivity).remove(change[..., None])[..., 0]
+    sizes = change, beyond_starts(settled, change)
     size = np.minimum(*(np.abs(x).reshape(segments.measured.shape) for x in sizes))
     trust = 1.0 / np.maximum(1.0, np.maximum.accumulate(size, axis=1) / TRUSTED)
     return dataclasses.replace(problem, segments=dataclasses.replace(segments, trust=trust))
@@ -112,19 +112,24 @@ def coarse_error(problem: Problem, current: Fit) -> np.ndarray:
 def timestep_error(problem: Problem, current: Fit) -> np.ndarray:
     """Return the engine's error at the model's timestep that no initial state undoes.
 
-    Where geoms can touch, much finer steps say it in segments where it is above the noise; see
-    `coarse_error`.
+    Where contacts or the stops of joints may act, much finer steps say it in segments where it is
+    above the noise; see `coarse_error`.
 
     Returns:
         Whitened, [S, N].
     """
     theta, start, residual = current.theta, current.start, current.residual
     change = coarse_error(problem, current)
-    loud = np.flatnonzero(np.abs(change).max(axis=1) > 1.0)
-    if len(loud) and can_any_touch(problem.simulator.host):
+    loud, host = np.flatnonzero(np.abs(change).max(axis=1) > 1.0), problem.simulator.host
+    if len(loud) and (can_any_touch(host) or np.any(host.jnt_limited)):
         finer = problem.simulator.refined(FINE)
         fine = problem.take(loud).residual_by(finer, theta, start[loud])
         change[loud] = FINE / (FINE - 1) * (fine - residual[loud])
+    return beyond_starts(current, change)
+
+
+def beyond_starts(current: Fit, change: np.ndarray) -> np.ndarray:
+    """Return what of a change of the residuals [S, N] no initial state undoes."""
     return StartSpace(current.sensitivity).remove(change[..., None])[..., 0]
 
 

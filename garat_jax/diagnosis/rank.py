@@ -43,14 +43,14 @@ from garat_jax.diagnosis.rivals import fill_out, refine
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle, settle_twice
-from garat_jax.diagnosis.steps import Step, fit_only, is_nil, prune, reconsider, refitted
+from garat_jax.diagnosis.steps import Step, fit_only, least_firm, prune, reconsider, refitted
 from garat_jax.diagnosis.timestep import count_timestep
 
 ROUNDS = 5
 FOLLOWED = 2
 """Candidates that are fitted beside each rival that is followed for one more effect."""
-NIL = "at a timestep of 0 its size is not told from none"
-"""Why one that passed every gate is not added."""
+NIL = "at a timestep of 0 it is not firmly told from what the model has"
+"""Why one that passed every other gate is not added."""
 AS_GOOD = "as good as what was added, beside what else was found"
 """Why a candidate that failed a gate by itself is no worse in the end."""
 
@@ -128,7 +128,7 @@ def explain(
     metric = make_metric(problem)
     floor = noise_floor(problem, metric, before)
     adequate = not is_above(problem, metric, before, floor)
-    found = _select(problem, before, floor, [], say)
+    found, was_adequate = _select(problem, before, floor, [], say), adequate
     candidates = found.candidates
     while found.steps or adequate:
         further = _on_longer(found, recordings, grid, say)
@@ -137,19 +137,19 @@ def explain(
         candidates = candidates if found.steps else further.candidates
         found, adequate = further, False
         before = settle(found.problem, found.problem.simulator.base, found.fit.start)
-    problem, steps, current = found.problem, found.steps, found.fit
-    steps, current = _counted(problem, steps, current, found.timeless, say)
-    nil = [step for step in found.steps if step.effect not in {s.effect for s in steps}]
-    floor = found.floor
-    if nil:
-        current = current if steps else before
-        floor = noise_floor(problem, make_metric(problem), current)
-    shown = _as_nil(nil) | _as_shown(problem, steps, current)
+    counted = _counted(found, say)
+    problem, steps, current, best = counted.problem, counted.steps, counted.fit, counted.best
+    if found.steps and not steps:  # as if nothing had passed
+        current, metric = before, make_metric(problem)
+        floor = noise_floor(problem, metric, current)
+        stays = signals_mostly_above(problem, metric, current, floor)
+        counted = counted._replace(floor=floor)
+        adequate = was_adequate and not np.any(stays)
+    shown = _as_shown(problem, steps, current)
     selected = apart([shown[step.candidate.named] for step in steps])
     shown |= {c.named: c for c in selected}
-    candidates = tuple(shown.get(c.named, c) for c in candidates)
-    best = current if steps else found.best
-    if not is_above(problem, make_metric(problem), current, floor):
+    candidates = _with_nil(tuple(shown.get(c.named, c) for c in candidates), found.steps, steps)
+    if not is_above(problem, make_metric(problem), current, counted.floor):
         best = None
     return Outcome(
         problem,
@@ -158,45 +158,48 @@ def explain(
         _without_superfluous(candidates, selected),
         tuple(steps),
         selected,
-        floor,
+        counted.floor,
         adequate and not steps,
         best,
     )
 
 
-def _counted(
-    problem: Problem, steps: Sequence[Step], current: Fit, timeless: Fit | None, say
-) -> tuple[list[Step], Fit]:
+def _counted(found: Selection, say: Callable[[str], None]) -> Selection:
     """Count the timestep's share of what was found; drop what is not told from no effect then.
 
     The integrator's error may look like a small effect that passes every gate.
 
-    Args:
-        problem: What is fitted.
-        steps: The effects added.
-        current: The fit with all of them.
-        timeless: The same counted to a timestep of 0, if that is known already.
-        say: Told what is being done.
-
     Returns:
-        The steps that are left, and the fit with their effects at a timestep of 0.
+        The steps that are left, with the fit and the noise floor at a timestep of 0.
     """
-    steps = list(steps)
+    problem, steps, current, timeless = found.problem, [*found.steps], found.fit, found.timeless
     while steps:
         say("counting the timestep's share")
         counted = settle_twice(problem, timeless or count_timestep(problem, current))
-        kept = [step for step in steps if not is_nil(problem, step.effect, counted)]
-        if len(kept) == len(steps):
-            return [*steps[:-1], steps[-1]._replace(fit=counted)], counted
-        current, timeless = fit_only(problem, current, [step.effect for step in kept]), None
-        steps = refitted(problem, kept, current) if kept else []
-    return steps, current
+        nil = least_firm(problem, steps, counted)
+        if nil is None:
+            steps[-1] = steps[-1]._replace(fit=counted)
+            return found._replace(steps=steps, fit=counted, best=counted)
+        steps = [step for step in steps if step is not nil]
+        if steps:
+            say(f"going on without {nil.candidate.named}")
+            current, timeless = fit_only(problem, current, [step.effect for step in steps]), None
+            steps = refitted(problem, steps, current)
+            found = found._replace(floor=noise_floor(problem, make_metric(problem), current))
+    return found._replace(steps=[], best=None if found.steps else found.best)
 
 
-def _as_nil(steps: Sequence[Step]) -> dict[Named, Candidate]:
-    """Return effects that a timestep of 0 does not need, and what did the same, as not passing."""
-    named = [c for step in steps for c in (step.candidate, *(other for other, _ in step.alike))]
-    return {c.named: dataclasses.replace(c, passes=False, why=NIL) for c in named}
+def _with_nil(
+    candidates: Sequence[Candidate], before: Sequence[Step], left: Sequence[Step]
+) -> tuple[Candidate, ...]:
+    """Say of those that were dropped, and of what these recordings do not tell from them, why."""
+    kept = {step.effect for step in left}
+    gone = [step.candidate for step in before if step.effect not in kept]
+    named = {n for c in gone for n in (c.named, *c.indistinguishable_from)}
+    return tuple(
+        dataclasses.replace(c, passes=False, why=NIL) if c.passes and c.named in named else c
+        for c in candidates
+    )
 
 
 def _on_longer(
@@ -343,7 +346,7 @@ def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
     corrected = []
     for candidate in candidates:
         if candidate.passes and candidate.named not in {*kept, *alike}:
-            why = f"superfluous with {' and '.join(map(str, kept))}"
+            why = f"superfluous with {' and '.join(map(str, kept)) or 'what was found later'}"
             candidate = dataclasses.replace(candidate, passes=False, why=why)
         corrected.append(candidate)
     dropped = any("superfluous" in c.why for c in corrected)

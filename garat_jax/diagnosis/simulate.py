@@ -24,7 +24,7 @@ from garat_jax.errors import UserError
 
 NUM_PROGRAMS, NUM_FINER = 40, 4
 """How many programs stay compiled: on a CPU one takes some 250 of a process's 65,530 memory maps,
-and a diagnosis has two simulators, of up to two batch sizes a program, and four finer ones."""
+and a diagnosis has two simulators, of up to two batch sizes a program, and five finer ones."""
 BATCH_SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
 substep, many simulations share its cost. Each size is compiled once."""

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from garat_jax.diagnosis.contend import (
+    FIRM,
     Contender,
     as_refined,
     complete,
+    firmness,
     fit_one,
-    is_firm,
     refines,
     under_another_name,
     with_evidence,
@@ -213,15 +214,21 @@ def fit_only(problem: Problem, current: Fit, effects: Sequence[int]) -> Fit:
     return fit(problem, theta, current.start, free, sensitivity=current.sensitivity)
 
 
-def is_nil(problem: Problem, effect: int, fitted: Fit) -> bool:
-    """Say whether no fitted parameter of an effect differs firmly from no effect.
+def least_firm(problem: Problem, steps: Sequence[Step], fitted: Fit) -> Step | None:
+    """Return the step whose effect differs least from none, of those that do not firmly.
 
-    Not so where an interval has no end: then the recordings do not say.
+    Those with one fitted parameter are asked: several may be certain together though none is by
+    itself. Where an interval has no end the recordings do not say.
     """
-    columns = {*columns_of(problem.simulator.slots, effect).values()} - {*fitted.frozen}
-    places = [i for i, j in enumerate(fitted.free) if j in columns]
-    have_ends = bool(np.all(np.isfinite([fitted.low[places], fitted.high[places]])))
-    return have_ends and not any(is_firm(problem, fitted, fitted.free[i]) for i in places)
+    simulator, unfirm = problem.simulator, []
+    width = dict(zip(fitted.free, fitted.high - fitted.low, strict=True))
+    for step in steps:
+        columns = columns_of(simulator.slots, step.effect).values()
+        own = [j for j in columns if j in width and j not in fitted.frozen]
+        if len(own) == 1 and np.isfinite(width[own[0]]):
+            unfirm.append((firmness(problem, fitted, own[0]), step))
+    firm, step = min(unfirm, key=lambda pair: pair[0], default=(np.inf, None))
+    return step if firm <= FIRM else None
 
 
 def _only(problem: Problem, current: Fit, effects: Sequence[int]) -> tuple[np.ndarray, list[int]]:

@@ -14,8 +14,8 @@ from garat_jax.diagnosis.fit import (
     uncertainty,
     wide,
 )
-from garat_jax.diagnosis.metric import coarse_error, trusted
-from garat_jax.diagnosis.problem import Linearisation, Problem, StartSpace, block_labels
+from garat_jax.diagnosis.metric import beyond_starts, coarse_error, trusted
+from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels
 from garat_jax.diagnosis.robust import regress
 from garat_jax.diagnosis.starts import KEPT_PROMISE, Fit, follow, settle_twice, start_step
 from garat_jax.diagnosis.surface import smooth_minimum
@@ -86,9 +86,8 @@ def _are_smooth(differences: Differences, keep: np.ndarray) -> bool:
 
 def _is_coarse(problem: Problem, fitted: Fit) -> bool:
     """Say whether the timestep's error is above the noise, as half of it tells."""
-    change = coarse_error(problem, fitted)[..., None]
-    change = StartSpace(fitted.sensitivity).remove(change)[problem.fitted]
-    return bool(np.sum(change**2) > np.sum(problem.expected[problem.fitted]))
+    change = beyond_starts(fitted, coarse_error(problem, fitted))
+    return bool(np.sum(change[problem.fitted] ** 2) > np.sum(problem.expected[problem.fitted]))
 
 
 def _at_minimum(

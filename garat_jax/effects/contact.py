@@ -196,13 +196,14 @@ class ContactCompliance(ContactEffect):
 
 def can_any_touch(host: mujoco.MjModel) -> bool:
     """Say whether any two geoms can touch."""
-    disabled = host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
-    return bool(host.npair and not disabled) or any(partners(host, g) for g in range(host.ngeom))
+    if _are_off(host):
+        return False
+    return host.npair > 0 or any(partners(host, geom) for geom in range(host.ngeom))
 
 
 def partners(host: mujoco.MjModel, geom: int) -> list[int]:
     """Return the geoms that a geom can touch by MuJoCo's rules, without those named in pairs."""
-    if host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+    if _are_off(host):
         return []
     named = _pairs(host, geom)
     listed = {*host.pair_geom1[named].tolist(), *host.pair_geom2[named].tolist()}
@@ -211,6 +212,10 @@ def partners(host: mujoco.MjModel, geom: int) -> list[int]:
         for other in range(host.ngeom)
         if other not in listed and _can_touch(host, geom, other)
     ]
+
+
+def _are_off(host: mujoco.MjModel) -> bool:
+    return bool(host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 
 def _pairs(host: mujoco.MjModel, geom: int) -> np.ndarray:

@@ -11,16 +11,16 @@ from garat_jax.diagnosis.findings import Candidate, Interval, Named
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon
 from garat_jax.diagnosis.judge import BEHIND
-from garat_jax.diagnosis.metric import make_metric
+from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.names import renamed
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import AS_GOOD, NIL, _as_nil, _as_shown, _counted
+from garat_jax.diagnosis.rank import AS_GOOD, NIL, Selection, _as_shown, _counted, _with_nil
 from garat_jax.diagnosis.screen import Score, screen
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
-from garat_jax.diagnosis.steps import Step, is_nil, prune, reconsider
+from garat_jax.diagnosis.steps import Step, least_firm, prune, reconsider
 from garat_jax.effects import (
     AsymmetricFriction,
     BackEmf,
@@ -219,49 +219,69 @@ def test_a_law_goes_where_one_that_refines_it_can_do_what_both_do():
     assert found["viscous_negative"] == pytest.approx(DAMPED, rel=0.1)
 
 
-def quiet(line: str) -> None:
-    pass
+def selection(problem: Problem, *effects: int) -> Selection:
+    """Return a selection of effects that were added one after the other and fitted together."""
+    together = fit_with(problem, *effects)
+    steps = [
+        Step(candidate(effect), contender(problem, effect), together, []) for effect in effects
+    ]
+    floor = noise_floor(problem, make_metric(problem), together)
+    return Selection(problem, steps, together, None, floor, (), None)
 
 
 def test_an_effect_whose_size_may_be_none_at_a_timestep_of_0_is_dropped(problem):
-    every = (DAMPING, OFFSET, GAIN)  # the gain is that of the model
-    added = fit_with(problem, *every)
-    steps = [Step(candidate(effect), contender(problem, effect), added, []) for effect in every]
-    left, counted = _counted(problem, steps, added, None, quiet)
-    assert [step.effect for step in left] == [DAMPING, OFFSET]
-    assert left[-1].fit is counted
-    assert counted.free == (DAMPING, OFFSET)
-    assert counted.theta[DAMPING] == pytest.approx(DAMPED, rel=0.05)
-    assert counted.theta[GAIN] == 1.0
+    found = selection(problem, DAMPING, OFFSET, GAIN)  # the gain is that of the model
+    counted = _counted(found, lambda line: None)
+    assert [step.effect for step in counted.steps] == [DAMPING, OFFSET]
+    assert counted.steps[-1].fit is counted.fit is counted.best
+    assert counted.fit.free == (DAMPING, OFFSET)
+    assert counted.fit.theta[DAMPING] == pytest.approx(DAMPED, rel=0.05)
+    assert counted.fit.theta[GAIN] == 1.0
+    assert len(found.steps) == 3
 
 
-def test_where_nothing_is_left_the_model_stays_as_it_is():
+def test_where_nothing_is_left_there_is_no_best_fit_either():
     recordings = [record(lambda spec: None, seed) for seed in range(2)]
     grid = choose_grid(recordings, 0.002)
     simulator = Simulator(MODEL, EFFECTS, grid)
     _, segments = choose_horizon(simulator, recordings, grid)
     clean = Problem(simulator, segments, segments.recording == 0, 0.004)
-    step = Step(candidate(OFFSET), contender(clean, OFFSET), fit_with(clean, OFFSET), [])
-    left, counted = _counted(clean, [step], step.fit, None, quiet)
-    assert left == []
-    np.testing.assert_array_equal(counted.theta, simulator.base)
+    counted = _counted(selection(clean, OFFSET), lambda line: None)
+    assert counted.steps == []
+    assert counted.best is None
 
 
-def test_an_interval_without_an_end_says_nothing_of_no_effect(problem):
-    found = fit_with(problem, OFFSET)
-    size = np.abs(found.theta[[OFFSET]])
+def test_the_least_firm_effect_is_that_nearest_to_none_and_no_other(problem):
+    found = selection(problem, DAMPING, OFFSET)
+    size = np.abs(found.fit.theta[[DAMPING, OFFSET]])
 
-    def within(half):
-        return dataclasses.replace(found, low=size - half * size, high=size + half * size)
+    def least(*halves):
+        half = np.array(halves) * size
+        fitted = dataclasses.replace(found.fit, low=size - half, high=size + half)
+        step = least_firm(problem, found.steps, fitted)
+        return None if step is None else step.effect
 
-    assert is_nil(problem, OFFSET, within(0.6))
-    assert not is_nil(problem, OFFSET, within(0.4))
-    assert not is_nil(problem, OFFSET, within(np.inf))
+    assert least(0.4, 0.4) is None
+    assert least(0.6, 0.4) == DAMPING
+    assert least(0.6, 0.9) == OFFSET
+    assert least(0.6, np.inf) == DAMPING  # of the other the recordings do not say
 
 
-def test_what_is_dropped_does_not_pass_and_neither_does_what_did_the_same(problem):
-    own, other = candidate(OFFSET), candidate(GAIN)
-    step = Step(own, contender(problem, OFFSET), fit_with(problem, OFFSET), [(other, None)])
-    shown = _as_nil([step])
-    assert {*shown} == {own.named, other.named}
-    assert all(not c.passes and c.why == NIL for c in shown.values())
+def test_an_effect_of_several_parameters_is_not_asked_one_by_one(problem):
+    found = selection(problem, DAMPING)
+    step = found.steps[0]._replace(contender=contender(problem, DAMPING))
+    half = 2.0 * np.abs(found.fit.theta[[DAMPING]])
+    unsure = dataclasses.replace(found.fit, low=-half, high=half)
+    assert least_firm(problem, [step], unsure) is step
+    frozen = dataclasses.replace(unsure, frozen=(DAMPING,))
+    assert least_firm(problem, [step], frozen) is None
+
+
+def test_what_was_dropped_does_not_pass_and_neither_does_what_is_not_told_from_it(problem):
+    found = selection(problem, DAMPING, OFFSET)
+    dropped = candidate(OFFSET, GAIN)
+    steps = [found.steps[0], found.steps[1]._replace(candidate=dropped)]
+    every = (candidate(DAMPING), dropped, candidate(GAIN), candidate(EMF))
+    said = _with_nil(every, steps, steps[:1])
+    assert [c.why == NIL for c in said] == [False, True, True, False]
+    assert [c.passes for c in said] == [True, False, False, True]

@@ -36,8 +36,16 @@ def test_the_pairs_that_are_named_are_those_that_mujoco_would_make():
 
 
 def test_where_no_contact_can_be_nothing_can_touch():
-    assert can_any_touch(spec(PAIRED).compile())
+    assert can_any_touch(
+        spec(
+            PAIRED.replace("<contact>", "<contact><!--").replace("</contact>", "--></contact>")
+        ).compile()
+    )
     assert not can_any_touch(spec(ARM).compile())
+    alone = spec(PAIRED)
+    for geom in alone.geoms:
+        geom.contype = geom.conaffinity = 0
+    assert can_any_touch(alone.compile())  # the named pair
     disabled = spec(PAIRED)
     disabled.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     assert not can_any_touch(disabled.compile())
