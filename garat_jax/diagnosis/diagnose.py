@@ -20,13 +20,13 @@ from garat_jax.diagnosis.horizon import (
     say_horizon,
     warn_of_divergence,
 )
-from garat_jax.diagnosis.judge import FEWEST_SEGMENTS, SMALLEST_SHARE, is_enough
+from garat_jax.diagnosis.judge import SMALLEST_SHARE, is_enough
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem
 from garat_jax.diagnosis.rank import NIL, Outcome, explain
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import SHORTEST, choose_grid

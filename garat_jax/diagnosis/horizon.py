@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from garat_jax.diagnosis.measurements import Recording, longest_span
-from garat_jax.diagnosis.problem import AnyProblem, Predictor, Problem
+from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, AnyProblem, Predictor, Problem
 from garat_jax.diagnosis.segments import QUIET, Grid, Segments, cut
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.errors import UserError
@@ -114,7 +114,8 @@ def cut_longer(
     """Cut into the longest segments over which a model with some parameters can be followed.
 
     As `choose_horizon`, but the error is that from initial states that are fitted: those measured
-    are noisy, and a better model has a smaller error than their noise makes.
+    are noisy, and a better model has a smaller error than their noise makes. Where too few could be
+    fitted to be certain of anything, shorter ones say more.
 
     Args:
         problem: The recordings, cut into shorter segments.
@@ -127,6 +128,8 @@ def cut_longer(
     """
     everything = np.arange(len(recordings))
     for longer, _ in _predictable(problem, recordings, grid, theta, everything):
+        if longer.fitted.sum() < FEWEST_SEGMENTS:
+            continue
         settled = settle(longer, theta, longer.segments.start)
         error = _error(longer.unwhiten(settled.residual), longer.segments)
         if _is_within(error.max(axis=1)):

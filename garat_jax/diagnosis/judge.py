@@ -8,7 +8,7 @@ from garat_jax.diagnosis.contend import Contender, refines
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
 from garat_jax.diagnosis.names import twins
-from garat_jax.diagnosis.problem import Problem, block_labels
+from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem, block_labels
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
 from garat_jax.diagnosis.starts import Fit
 from garat_jax.effects import Parameter
@@ -23,8 +23,6 @@ STABLE = 0.8
 NEGLIGIBLE = 0.01
 """Part of the fall of the held-out error by which a resample may rise: one without any moment at
 which the effect acts shows next to no change."""
-FEWEST_SEGMENTS = 3
-"""Fitted segments, and blocks of time held out, below which nothing is certain."""
 TOO_CLOSE = 1.05
 """Ratio of two candidates' costs below which neither leads, whatever the resamples say."""
 ROUNDING = 1e-9

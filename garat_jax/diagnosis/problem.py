@@ -16,6 +16,8 @@ from garat_jax.diagnosis.segments import Segments
 from garat_jax.diagnosis.simulate import Slot
 from garat_jax.effects import Effect, Suggestion
 
+FEWEST_SEGMENTS = 3
+"""Fitted segments, and blocks of time held out, below which nothing is certain."""
 BLOCK = 0.25
 """Seconds of the shortest block within which errors may be correlated, in robust variances."""
 START_STEP = 1e-4

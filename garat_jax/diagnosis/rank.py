@@ -174,7 +174,7 @@ def _counted(found: Selection, say: Callable[[str], None]) -> Selection:
     """
     problem, steps, current, timeless = found.problem, [*found.steps], found.fit, found.timeless
     while steps:
-        say("counting the timestep's share")
+        say("correcting the sizes for the timestep's error")
         counted = settle_twice(problem, timeless or count_timestep(problem, current))
         nil = least_firm(problem, steps, counted)
         if nil is None:

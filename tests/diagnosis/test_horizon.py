@@ -75,7 +75,7 @@ def test_a_gap_that_shows_in_long_segments_alone_is_measured_there():
     assert longest and cut_longest(longest, recordings, grid, simulator.base) is None
 
 
-def test_segments_are_no_longer_than_the_recordings():
+def test_segments_are_no_longer_than_the_recordings_or_than_leaves_three_to_fit():
     spans = ((0, 300),)
     recordings = [dataclasses.replace(r, spans=spans) for r in record_weak(0.0)]
     grid = choose_grid(recordings, 0.002)
@@ -85,6 +85,10 @@ def test_segments_are_no_longer_than_the_recordings():
     found = cut_longer(problem, recordings, grid, np.asarray([GAIN]))
     assert found
     assert found[0].horizon == pytest.approx(1.0)
+    one = dataclasses.replace(problem, fitted=segments.recording < 1)
+    found = cut_longer(one, recordings, grid, np.asarray([GAIN]))
+    assert found
+    assert found[0].horizon == pytest.approx(0.5)
 
 
 def test_recordings_shorter_than_any_horizon_are_followed_whole():

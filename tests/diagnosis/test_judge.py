@@ -7,7 +7,7 @@ import pytest
 
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Interval
-from garat_jax.diagnosis.judge import FEWEST_SEGMENTS, TOO_FEW, _at_end, is_certain, judge
+from garat_jax.diagnosis.judge import TOO_FEW, _at_end, is_certain, judge
 from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
