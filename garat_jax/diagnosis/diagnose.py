@@ -20,14 +20,14 @@ from garat_jax.diagnosis.horizon import (
     say_horizon,
     warn_of_divergence,
 )
-from garat_jax.diagnosis.judge import SMALLEST_SHARE, is_enough
+from garat_jax.diagnosis.judge import NIL, SMALLEST_SHARE, is_enough
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem
-from garat_jax.diagnosis.rank import NIL, Outcome, explain
+from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import SHORTEST, choose_grid
 from garat_jax.diagnosis.separate import next_experiment
@@ -70,7 +70,8 @@ def diagnose(
     others = make_candidates(whole)
     grid = choose_grid(everything, host.opt.timestep)
     say("choosing the horizon")
-    horizon, segments = choose_horizon(Simulator(whole, (), grid), everything, grid)
+    plain = Simulator(whole, (), grid)
+    horizon, segments = choose_horizon(plain, everything, grid, num_fitted=len(fitted))
     say(say_horizon(everything, horizon))
     simulator = Simulator(model, (*shared, *others), grid, acting=range(len(shared)))
     warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
@@ -192,7 +193,7 @@ def few_segments(problem: Problem) -> tuple[str, ...]:
     """Say that too little was recorded to be certain of anything; nothing where it suffices."""
     if is_enough(problem):
         return ()
-    num, how = int(problem.fitted.sum()), "fitted"
+    num, how = problem.num_fitted, "fitted"
     if num >= FEWEST_SEGMENTS:
         num, how = int((~problem.fitted).sum()), "held out"
     pieces = f"{num} piece" + "s" * (num != 1)

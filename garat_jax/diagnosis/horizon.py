@@ -31,9 +31,15 @@ timestep makes most of that: a model that only lacks an effect errs alike at any
 
 
 def choose_horizon(
-    simulator: Predictor, recordings: Sequence[Recording], grid: Grid
+    simulator: Predictor,
+    recordings: Sequence[Recording],
+    grid: Grid,
+    num_fitted: int | None = None,
 ) -> tuple[float, Segments]:
     """Choose the longest horizon over which fits are nearly linear, and cut there.
+
+    The longest of those that leave enough segments to be certain, of the first `num_fitted`
+    recordings or of all.
 
     Growth is the change of the signals after a small change of the initial state, both relative to
     the signals' spread, if it lasts; the error is that of the model from the measured initial
@@ -45,13 +51,16 @@ def choose_horizon(
     sample = grid.interval * grid.per_sample
     predicted = _perturbed(simulator, simulator.base, segments)
     growth, error = _growth(predicted, segments), _error(predicted[0], segments)
-    horizon = horizons[-1]
-    for horizon in horizons:
+    for horizon in horizons[:-1]:
         length = max(2, round(horizon / sample))
         grown, wrong = _lasting(growth[:, :length]), error[:, :length].max(axis=1)
-        if _is_within(grown) and _is_within(wrong):
-            break
-    return horizon, segments if horizon == horizons[0] else cut(recordings, grid, horizon)
+        if not (_is_within(grown) and _is_within(wrong)):
+            continue
+        chosen = segments if horizon == horizons[0] else cut(recordings, grid, horizon)
+        fitted = chosen.recording < (len(recordings) if num_fitted is None else num_fitted)
+        if np.sum(fitted & chosen.is_whole) >= FEWEST_SEGMENTS:
+            return horizon, chosen
+    return horizons[-1], cut(recordings, grid, horizons[-1])
 
 
 def warn_of_divergence(
@@ -104,7 +113,7 @@ def say_horizon(recordings: Sequence[Recording], horizon: float) -> str:
         return f"following the recordings for {horizon:g} s at a time"
     return (
         f"segments were shortened to {horizon:g} s: within longer ones the model's error, or a "
-        "small change of its initial state, grows too much"
+        "small change of its initial state, grows too much, or there are too few of them"
     )
 
 
@@ -128,7 +137,7 @@ def cut_longer(
     """
     everything = np.arange(len(recordings))
     for longer, _ in _predictable(problem, recordings, grid, theta, everything):
-        if longer.fitted.sum() < FEWEST_SEGMENTS:
+        if longer.num_fitted < FEWEST_SEGMENTS:
             continue
         settled = settle(longer, theta, longer.segments.start)
         error = _error(longer.unwhiten(settled.residual), longer.segments)

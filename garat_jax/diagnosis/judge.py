@@ -29,6 +29,8 @@ ROUNDING = 1e-9
 """Distance from a bound, relative to a parameter's `scale`, that is only rounding: descents
 reach bounds by adding steps."""
 TOO_FEW = "too few pieces of recordings to be certain"
+NIL = "at a timestep of 0 it is not firmly told from what the model has"
+"""Why one that passed every other gate is not added."""
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
 BEHIND = "another explains more for certain"
 NO_CERTAIN_GAIN = "the held-out error does not fall for certain"
@@ -183,7 +185,7 @@ def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, al
 def is_enough(problem: Problem) -> bool:
     """Say whether there is enough, fitted and held out, to be certain of anything."""
     num_held_out = len(np.unique(block_labels(problem)[~problem.fitted]))
-    return min(int(problem.fitted.sum()), num_held_out) >= FEWEST_SEGMENTS
+    return min(problem.num_fitted, num_held_out) >= FEWEST_SEGMENTS
 
 
 def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stability: float) -> str:

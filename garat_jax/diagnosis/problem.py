@@ -93,6 +93,11 @@ class Problem(Generic[AnySimulator]):
         return self.segments.measured.shape[1] * self.interval
 
     @property
+    def num_fitted(self) -> int:
+        """Return how many segments are fitted, without short rests of recordings."""
+        return int(np.sum(self.fitted & self.segments.is_whole))
+
+    @property
     def num_signals(self) -> int:
         """Return how many signals were measured or estimated at each sample."""
         return self.segments.measured.shape[2]

@@ -25,7 +25,7 @@ from garat_jax.diagnosis.contend import (
 from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import cut_ever_longer, cut_longer
-from garat_jax.diagnosis.judge import Judged, estimates, judge
+from garat_jax.diagnosis.judge import NIL, Judged, estimates, judge
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import (
     ABOVE_FLOOR,
@@ -49,8 +49,6 @@ from garat_jax.diagnosis.timestep import count_timestep
 ROUNDS = 5
 FOLLOWED = 2
 """Candidates that are fitted beside each rival that is followed for one more effect."""
-NIL = "at a timestep of 0 it is not firmly told from what the model has"
-"""Why one that passed every other gate is not added."""
 AS_GOOD = "as good as what was added, beside what else was found"
 """Why a candidate that failed a gate by itself is no worse in the end."""
 
@@ -125,10 +123,9 @@ def explain(
         say: Told what is being done.
     """
     before = settle(problem, problem.simulator.base, start)
-    metric = make_metric(problem)
-    floor = noise_floor(problem, metric, before)
-    adequate = not is_above(problem, metric, before, floor)
-    found, was_adequate = _select(problem, before, floor, [], say), adequate
+    floor = noise_floor(problem, make_metric(problem), before)
+    adequate = not is_above(problem, make_metric(problem), before, floor)
+    found, at_first = _select(problem, before, floor, [], say), (problem, before, floor, adequate)
     candidates = found.candidates
     while found.steps or adequate:
         further = _on_longer(found, recordings, grid, say)
@@ -137,19 +134,15 @@ def explain(
         candidates = candidates if found.steps else further.candidates
         found, adequate = further, False
         before = settle(found.problem, found.problem.simulator.base, found.fit.start)
-    counted = _counted(found, say)
-    problem, steps, current, best = counted.problem, counted.steps, counted.fit, counted.best
-    if found.steps and not steps:  # as if nothing had passed
-        current, metric = before, make_metric(problem)
-        floor = noise_floor(problem, metric, current)
-        stays = signals_mostly_above(problem, metric, current, floor)
-        counted = counted._replace(floor=floor)
-        adequate = was_adequate and not np.any(stays)
+    problem, steps, current, floor, best = _counted(found, say)
+    if found.steps and not steps:
+        problem, before, floor, adequate = _as_nothing_passed(problem, before, at_first)
+        current, best = before, None
     shown = _as_shown(problem, steps, current)
     selected = apart([shown[step.candidate.named] for step in steps])
     shown |= {c.named: c for c in selected}
     candidates = _with_nil(tuple(shown.get(c.named, c) for c in candidates), found.steps, steps)
-    if not is_above(problem, make_metric(problem), current, counted.floor):
+    if not is_above(problem, make_metric(problem), current, floor):
         best = None
     return Outcome(
         problem,
@@ -158,47 +151,69 @@ def explain(
         _without_superfluous(candidates, selected),
         tuple(steps),
         selected,
-        counted.floor,
+        floor,
         adequate and not steps,
         best,
     )
 
 
-def _counted(found: Selection, say: Callable[[str], None]) -> Selection:
+def _counted(found: Selection, say: Callable[[str], None]):
     """Count the timestep's share of what was found; drop what is not told from no effect then.
 
-    The integrator's error may look like a small effect that passes every gate.
+    The integrator's error may look like a small effect that passes every gate. One goes at a time,
+    the least firm first.
 
     Returns:
-        The steps that are left, with the fit and the noise floor at a timestep of 0.
+        The problem, the steps that are left, their fit at a timestep of 0, the noise floor at the
+        model's own, and the fit that says most of what is left.
     """
     problem, steps, current, timeless = found.problem, [*found.steps], found.fit, found.timeless
+    floor = found.floor
     while steps:
         say("correcting the sizes for the timestep's error")
         counted = settle_twice(problem, timeless or count_timestep(problem, current))
         nil = least_firm(problem, steps, counted)
         if nil is None:
             steps[-1] = steps[-1]._replace(fit=counted)
-            return found._replace(steps=steps, fit=counted, best=counted)
+            return problem, steps, counted, floor, counted
         steps = [step for step in steps if step is not nil]
-        if steps:
-            say(f"going on without {nil.candidate.named}")
-            current, timeless = fit_only(problem, current, [step.effect for step in steps]), None
-            steps = refitted(problem, steps, current)
-            found = found._replace(floor=noise_floor(problem, make_metric(problem), current))
-    return found._replace(steps=[], best=None if found.steps else found.best)
+        say(f"going on without {nil.candidate.named}")
+        current, timeless = fit_only(problem, current, [step.effect for step in steps]), None
+        steps = refitted(problem, steps, current) if steps else []
+        floor = noise_floor(problem, make_metric(problem), current)
+    return problem, steps, current, floor, found.best
+
+
+def _as_nothing_passed(problem: Problem, before: Fit, at_first):
+    """Return the problem, the model as it is, its floor and whether it is adequate.
+
+    All that was found was dropped. One that was adequate `at_first`, in shorter segments, is so,
+    unless it errs in most of these.
+    """
+    metric = make_metric(problem)
+    floor = noise_floor(problem, metric, before)
+    if at_first[-1] and not np.any(signals_mostly_above(problem, metric, before, floor)):
+        return at_first
+    return problem, before, floor, False
 
 
 def _with_nil(
     candidates: Sequence[Candidate], before: Sequence[Step], left: Sequence[Step]
 ) -> tuple[Candidate, ...]:
-    """Say of those that were dropped, and of what these recordings do not tell from them, why."""
+    """Say of those that were dropped, and of what these recordings do not tell from them, why.
+
+    Where nothing is left, so of all that passed: they gave way to what was dropped.
+    """
     kept = {step.effect for step in left}
     gone = [step.candidate for step in before if step.effect not in kept]
-    named = {n for c in gone for n in (c.named, *c.indistinguishable_from)}
+    own = {c.named for c in gone}
+    alike = {named for c in gone for named in c.indistinguishable_from}
+
+    def is_nil(c: Candidate) -> bool:
+        return c.named in own or (c.passes and (c.named in alike or bool(gone and not left)))
+
     return tuple(
-        dataclasses.replace(c, passes=False, why=NIL) if c.passes and c.named in named else c
-        for c in candidates
+        dataclasses.replace(c, passes=False, why=NIL) if is_nil(c) else c for c in candidates
     )
 
 
@@ -346,7 +361,7 @@ def _without_superfluous(candidates, selected) -> tuple[Candidate, ...]:
     corrected = []
     for candidate in candidates:
         if candidate.passes and candidate.named not in {*kept, *alike}:
-            why = f"superfluous with {' and '.join(map(str, kept)) or 'what was found later'}"
+            why = f"superfluous with {' and '.join(map(str, kept))}"
             candidate = dataclasses.replace(candidate, passes=False, why=why)
         corrected.append(candidate)
     dropped = any("superfluous" in c.why for c in corrected)

@@ -109,6 +109,11 @@ def _verdict(diagnosis: Diagnosis) -> str:
         )
     if diagnosis.is_too_short:
         return diagnosis.sentence
+    if dropped := diagnosis.dropped(label):
+        return (
+            f"{dropped[:1].upper()}{dropped[1:]} would explain much, but not for certain at a "
+            f"timestep of 0, and is not added: {diagnosis.rest}. A smaller timestep may tell."
+        )
     return f"Something is missing that no effect in the catalogue explains: {diagnosis.rest}."
 
 

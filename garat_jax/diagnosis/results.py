@@ -17,7 +17,7 @@ from garat_jax.diagnosis.findings import (
     Unseen,
     list_unseen,
 )
-from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD, SMALLEST_SHARE, TOO_FEW
+from garat_jax.diagnosis.judge import NIL, NO_CERTAIN_LEAD, SMALLEST_SHARE, TOO_FEW
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.metric import ABOVE_FLOOR
 from garat_jax.errors import choose
@@ -29,6 +29,8 @@ OFFER = (
     "MODEL DATA... --method gat, or garat; garat compare --grounded then says how much that is."
 )
 """What is said where the verdict is `unexplained`."""
+MOST_LISTED = 6
+"""Candidates that are printed, the first; so is what passes, wherever it stands."""
 TOO_COARSE = 1.0 / ABOVE_FLOOR
 """Integrator's error, relative to the signals' spread, above which a model that is as bad as always
 predicting the mean would be near the floor."""
@@ -233,12 +235,21 @@ class Diagnosis:
             return f"None of {rivals} leads for certain, and none is added: {self.rest}."
         if self.is_too_short:
             return f"Too little was recorded to be certain of what is missing: {self.rest}."
+        if dropped := self.dropped():
+            return (
+                f"{dropped} would explain much, but not for certain at a timestep of 0, and is not "
+                f"added: {self.rest}; give the model a smaller timestep to be certain."
+            )
         return f"Nothing in the catalogue explains the error: {self.rest}."
 
     @property
     def is_too_short(self) -> bool:
         """Whether too little could be fitted to be certain of any effect."""
         return any(candidate.why == TOO_FEW for candidate in self.candidates)
+
+    def dropped(self, spell: Callable[[Named], str] = str) -> str:
+        """Spell the first candidate that only the timestep's error keeps back; empty if none is."""
+        return next((spell(c.named) for c in self.candidates if c.why == NIL), "")
 
     def rivals(self, spell: Callable[[Named], str] = str) -> str:
         """Spell the first candidates that only rivals keep back; empty if there are not several."""
@@ -307,7 +318,7 @@ class Diagnosis:
         if self.unseen:
             lines.append(f"  not shown by these recordings: {list_unseen(self.unseen)}")
         final = {c.named for c in self.selected} if len(self.selected) > 1 else set()
-        for c in self.candidates[:6]:
+        for c in [c for i, c in enumerate(self.candidates) if i < MOST_LISTED or c.passes]:
             fitted = f", held-out error {c.error_after:.3g}, stability {c.stability:.2f}"
             share = f"share {c.share:.2f}{fitted if math.isfinite(c.error_after) else ' expected'}"
             share = f"when it was added {share}" if c.named in final else share

@@ -77,6 +77,12 @@ class Segments:
     spread: np.ndarray
     start_unit: np.ndarray
 
+    @property
+    def is_whole(self) -> np.ndarray:
+        """Say which last half as long as the longest or more, [S] bool: not rests of recordings."""
+        samples = np.count_nonzero(self.weight, axis=1)
+        return 2 * samples >= samples.max(initial=0)
+
     def take(self, chosen: np.ndarray) -> "Segments":
         """Return some of the segments; noise, spread, units and past stay those of all."""
         by_segment = ("measured", "weight", "observed", "trust", "start", "ctrl", "place")

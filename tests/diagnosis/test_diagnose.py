@@ -14,6 +14,8 @@ from garat_jax.diagnosis import Recording, compare, diagnose, load_model
 from garat_jax.diagnosis.convert import free_pendulum
 from garat_jax.diagnosis.diagnose import verdict_of
 from garat_jax.diagnosis.hidden import DRAWN, OUTSIDE, make_recordings
+from garat_jax.diagnosis.judge import NIL
+from garat_jax.diagnosis.report import diagnosis_lead
 from garat_jax.diagnosis.results import Errors
 from garat_jax.errors import UserError
 from garat_jax.runs import RunDirectory
@@ -73,6 +75,20 @@ def test_nothing_is_claimed_from_too_few_pieces(tmp_path):
     assert found.verdict == "unexplained"
     assert not found.selected and not found.drifts
     assert found.sentence.startswith("Too little was recorded to be certain of what is missing")
+
+
+def test_what_a_timestep_of_0_does_not_need_is_said_and_what_passes_is_printed(tmp_path):
+    _, found = find(tmp_path, 20, "coulomb_friction", **FASTEST)
+    (first, *others), many = found.candidates, 10 * found.candidates[1:]
+    assert first.passes and f"  * {first.named}" in str(
+        dataclasses.replace(found, candidates=(*many, first))
+    )
+    dropped = dataclasses.replace(first, passes=False, why=NIL)
+    nothing = dataclasses.replace(
+        found, verdict="unexplained", selected=(), ladder=(), candidates=(dropped, *others)
+    )
+    for said in (nothing.sentence, diagnosis_lead(nothing)):
+        assert "would explain much, but not for certain at a timestep of 0" in said
 
 
 def test_a_clean_model_is_adequate(tmp_path):

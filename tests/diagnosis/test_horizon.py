@@ -85,10 +85,22 @@ def test_segments_are_no_longer_than_the_recordings_or_than_leaves_three_to_fit(
     found = cut_longer(problem, recordings, grid, np.asarray([GAIN]))
     assert found
     assert found[0].horizon == pytest.approx(1.0)
-    one = dataclasses.replace(problem, fitted=segments.recording < 1)
-    found = cut_longer(one, recordings, grid, np.asarray([GAIN]))
+    two = dataclasses.replace(problem, fitted=segments.recording < 2)  # whole segments of 1 s: two
+    found = cut_longer(two, recordings, grid, np.asarray([GAIN]))
     assert found
     assert found[0].horizon == pytest.approx(0.5)
+
+
+def test_a_good_model_is_not_followed_for_so_long_that_less_than_three_segments_are_left():
+    whole = record_weak(0.0)[:2]
+    recordings = [dataclasses.replace(r, spans=((0, 550),)) for r in whole]
+    grid = choose_grid(recordings, 0.002)
+    gain = MotorGain("actuator/motor", scale=GAIN)
+    true = Simulator(dataclasses.replace(MODEL, effects=(gain,)), (), grid)
+    assert choose_horizon(true, whole, grid)[0] == 2.0
+    chosen = [choose_horizon(true, recordings, grid, num) for num in (None, 1)]
+    assert [horizon for horizon, _ in chosen] == [1.0, 0.5]
+    assert chosen[0][1].is_whole.tolist() == [True, True, False] * 2
 
 
 def test_recordings_shorter_than_any_horizon_are_followed_whole():

@@ -97,7 +97,7 @@ def test_nothing_passes_where_a_moment_is_held_out(problem):
     kept = np.union1d(np.flatnonzero(problem.fitted), held_out[:1])
     first, _ = judged(problem.take(kept), 0.7, 0.8)
     num_blocks = len(np.unique(problem.blocks()))
-    assert num_blocks < FEWEST_SEGMENTS
+    assert num_blocks < 3
     assert first.why == TOO_FEW
 
 

@@ -10,12 +10,19 @@ from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Candidate, Interval, Named
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon
-from garat_jax.diagnosis.judge import BEHIND
+from garat_jax.diagnosis.judge import BEHIND, NIL
 from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.names import renamed
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rank import AS_GOOD, NIL, Selection, _as_shown, _counted, _with_nil
+from garat_jax.diagnosis.rank import (
+    AS_GOOD,
+    Selection,
+    _as_nothing_passed,
+    _as_shown,
+    _counted,
+    _with_nil,
+)
 from garat_jax.diagnosis.screen import Score, screen
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
@@ -231,24 +238,34 @@ def selection(problem: Problem, *effects: int) -> Selection:
 
 def test_an_effect_whose_size_may_be_none_at_a_timestep_of_0_is_dropped(problem):
     found = selection(problem, DAMPING, OFFSET, GAIN)  # the gain is that of the model
-    counted = _counted(found, lambda line: None)
-    assert [step.effect for step in counted.steps] == [DAMPING, OFFSET]
-    assert counted.steps[-1].fit is counted.fit is counted.best
-    assert counted.fit.free == (DAMPING, OFFSET)
-    assert counted.fit.theta[DAMPING] == pytest.approx(DAMPED, rel=0.05)
-    assert counted.fit.theta[GAIN] == 1.0
+    _, steps, fitted, floor, best = _counted(found, lambda line: None)
+    assert [step.effect for step in steps] == [DAMPING, OFFSET]
+    assert steps[-1].fit is fitted is best
+    assert fitted.free == (DAMPING, OFFSET)
+    assert fitted.theta[DAMPING] == pytest.approx(DAMPED, rel=0.05)
+    assert fitted.theta[GAIN] == 1.0
+    assert floor is not found.floor
     assert len(found.steps) == 3
 
 
-def test_where_nothing_is_left_there_is_no_best_fit_either():
+def test_where_all_is_dropped_a_model_that_was_adequate_stays_so_unless_it_errs_in_most(problem):
     recordings = [record(lambda spec: None, seed) for seed in range(2)]
     grid = choose_grid(recordings, 0.002)
     simulator = Simulator(MODEL, EFFECTS, grid)
     _, segments = choose_horizon(simulator, recordings, grid)
     clean = Problem(simulator, segments, segments.recording == 0, 0.004)
-    counted = _counted(selection(clean, OFFSET), lambda line: None)
-    assert counted.steps == []
-    assert counted.best is None
+    found = selection(clean, OFFSET)
+    assert _counted(found, lambda line: None)[1] == []
+    for judged, was_adequate, is_adequate in (
+        (clean, True, True),
+        (clean, False, False),
+        (problem, True, False),
+    ):
+        before = settle(judged, judged.simulator.base, judged.segments.start)
+        at_first = ("shorter segments", None, None, was_adequate)
+        said = _as_nothing_passed(judged, before, at_first)
+        assert said[-1] is is_adequate
+        assert (said is at_first) is is_adequate
 
 
 def test_the_least_firm_effect_is_that_nearest_to_none_and_no_other(problem):
@@ -268,13 +285,18 @@ def test_the_least_firm_effect_is_that_nearest_to_none_and_no_other(problem):
 
 
 def test_an_effect_of_several_parameters_is_not_asked_one_by_one(problem):
-    found = selection(problem, DAMPING)
-    step = found.steps[0]._replace(contender=contender(problem, DAMPING))
-    half = 2.0 * np.abs(found.fit.theta[[DAMPING]])
-    unsure = dataclasses.replace(found.fit, low=-half, high=half)
-    assert least_firm(problem, [step], unsure) is step
-    frozen = dataclasses.replace(unsure, frozen=(DAMPING,))
-    assert least_firm(problem, [step], frozen) is None
+    grid = choose_grid([record(lambda spec: None, 0)], 0.002)
+    rubbing = dataclasses.replace(
+        problem, simulator=Simulator(MODEL, (AsymmetricFriction(AT),), grid)
+    )
+    found = fit_with(problem, DAMPING)
+    score = Score(0, (0, 1), (0.0, 0.0), {}, 0.5, 0.0, True, np.zeros(0))
+    step = Step(candidate(DAMPING), Contender(score, found), found, [])
+    theta, ends = np.full(4, 0.1), np.ones(2)
+    two = dataclasses.replace(found, theta=theta, free=(0, 1), frozen=(), low=-ends, high=ends)
+    assert least_firm(rubbing, [step], two) is None
+    assert least_firm(rubbing, [step], dataclasses.replace(two, frozen=(1,))) is step
+    assert least_firm(rubbing, [step], dataclasses.replace(two, frozen=(0, 1))) is None
 
 
 def test_what_was_dropped_does_not_pass_and_neither_does_what_is_not_told_from_it(problem):
@@ -285,3 +307,6 @@ def test_what_was_dropped_does_not_pass_and_neither_does_what_is_not_told_from_i
     said = _with_nil(every, steps, steps[:1])
     assert [c.why == NIL for c in said] == [False, True, True, False]
     assert [c.passes for c in said] == [True, False, False, True]
+    nothing = _with_nil(every, steps, [])
+    assert not any(c.passes for c in nothing)
+    assert nothing[-1].why == NIL  # it gave way to what was dropped
