@@ -1,7 +1,8 @@
 """Measure how steps a second grow with the number of environments, and of seeds.
 
 `python benchmarks/growth.py`: TRPO and random actions, the number of environments of one seed from
-1 to 4096, and the number of seeds with the presets' 50 environments each.
+1 to 4096, and the number of seeds with the presets' 50 environments each. The result is written
+anew after each world, so that a run that is cut off keeps those it has.
 """
 
 import dataclasses
@@ -73,21 +74,21 @@ def grow(name: str, grows: str, sizes: Sequence[Size], arguments: Arguments) -> 
 
 def main() -> None:
     arguments = tyro.cli(Arguments)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name in arguments.envs:
         by_envs = [size_of(1, num_envs) for num_envs in arguments.num_envs]
         by_seeds = [size_of(num_seeds, 50) for num_seeds in arguments.num_seeds]
         rows += grow(name, "envs", by_envs, arguments)
         rows += grow(name, "seeds", by_seeds, arguments)
-    print(
-        write_result(
-            "growth",
-            rows,
-            seeds=list(range(max(arguments.num_seeds))),
-            command=command_line(),
-            folder=arguments.out,
+        print(
+            write_result(
+                "growth",
+                rows,
+                seeds=list(range(max(arguments.num_seeds))),
+                command=command_line(),
+                folder=arguments.out,
+            )
         )
-    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Writes the results of benchmarks, each with what is needed to get them again."""
 
 import datetime
+import functools
 import json
 import shlex
 import sys
@@ -49,7 +50,7 @@ def write_result(
         "command": command,
         "seeds": list(seeds),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        **provenance(),
+        **_made_by(),
         "device": _device().device_kind,
         **(details or {}),
         "rows": rows,
@@ -64,6 +65,12 @@ def result_path(name: str, folder: Path = RESULTS) -> Path:
     """Return a benchmark's result file: `<name>.json`, on an accelerator `<name>_gpu.json`."""
     platform = _device().platform
     return folder / f"{name if platform == 'cpu' else f'{name}_{platform}'}.json"
+
+
+@functools.cache
+def _made_by() -> dict[str, Any]:
+    """Return `provenance()` before this process first wrote a result: writing changes the tree."""
+    return provenance()
 
 
 def _device():

@@ -2,7 +2,8 @@
 
 `python benchmarks/throughput.py`: iterations of TRPO and of PPO with the presets' settings; the
 same steps with random actions; C MuJoCo alone; and other libraries' TRPO and PPO with the same
-hyper-parameters in the same worlds. All are compiled and warm, and run in turns.
+hyper-parameters in the same worlds. All are compiled and warm, and run in turns. The result is
+written anew after each world, so that a run that is cut off keeps those it has.
 """
 
 import dataclasses
@@ -125,22 +126,21 @@ def main() -> None:
     for name in arguments.envs:
         for found, more in zip((rows, tried, costs), measure_world(name, arguments), strict=True):
             found += more
-    details = {
-        "load_average_after": os.getloadavg(),
-        "choices_of_the_peers": tried,
-        "parts_of_a_trpo_iteration": costs,
-    }
-    seeds = list(range(5))
-    print(
-        write_result(
-            "throughput",
-            rows,
-            seeds=seeds,
-            command=command_line(),
-            details=details,
-            folder=arguments.out,
+        details = {
+            "load_average_after": os.getloadavg(),
+            "choices_of_the_peers": tried,
+            "parts_of_a_trpo_iteration": costs,
+        }
+        print(
+            write_result(
+                "throughput",
+                rows,
+                seeds=list(range(5)),
+                command=command_line(),
+                details=details,
+                folder=arguments.out,
+            )
         )
-    )
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,12 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 
 # Before the first import of JAX, and inherited by the processes that tests start.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
-# Tests compile more than they run: these halve the first, and cost a quarter of the second.
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
-)
+# Tests compile more than they run: these halve the first, and cost a quarter of the second. A flag
+# that is gone, as the first is from jaxlib 0.11.1 on, ends the process.
+_flags = ["--xla_backend_optimization_level=1"]
+if tuple(int(number) for number in metadata.version("jaxlib").split(".")[:3]) < (0, 11, 1):
+    _flags.insert(0, "--xla_cpu_use_fusion_emitters=false")
+os.environ.setdefault("XLA_FLAGS", " ".join(_flags))
 compilation_cache.enable()
 # Shells have what they start in the background ignore Ctrl-C, and so would the programs that tests
 # interrupt.
