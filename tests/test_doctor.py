@@ -8,7 +8,7 @@ import jax
 import pytest
 
 from garat_jax import cli, doctor
-from garat_jax.doctor import BATCH, Rate
+from garat_jax.doctor import BATCH, MANY, Rate
 from garat_jax.errors import UserError
 
 
@@ -24,7 +24,7 @@ def test_it_measures_both_engines_and_names_what_there_is(monkeypatch, capsys):
     found = []
 
     def examine(device: str, examine=doctor.examine):
-        found.append(examine(device, seconds=0.01))
+        found.append(examine(device, seconds=0.04))
         return found[0]
 
     monkeypatch.setattr(doctor, "examine", examine)
@@ -50,7 +50,7 @@ def test_it_measures_programs_as_they_are_compiled_elsewhere(monkeypatch):
 
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     monkeypatch.setattr(jax.stages.Lowered, "compile", compile)
-    doctor.examine("auto", seconds=0.01)
+    doctor.examine("auto", seconds=0.04)
     assert taken.count({"xla_backend_optimization_level": 1}) == 2
     assert {} in taken
 
@@ -77,6 +77,13 @@ def test_advice_follows_from_the_rates_and_the_settings(monkeypatch):
     assert {"XLA_FLAGS", "Compiled"} <= {
         line.split()[0] for line in doctor.advise(rates(1.0, 1.0), "cpu")
     }
+
+
+def test_on_an_accelerator_it_says_what_thousands_of_simulations_gain():
+    many = [Rate("mujoco", MANY, 15.0), Rate("mjx", MANY, 600.0)]
+    told = doctor.advise([*rates(1.0, 2.0), *many], "gpu")
+    assert any("4096 at once do 30 times the steps of 64" in line for line in told)
+    assert not any("4096" in line for line in doctor.advise(rates(1.0, 2.0), "cpu"))
 
 
 def test_a_device_that_is_not_there_is_one_line_and_status_2(monkeypatch, capsys):

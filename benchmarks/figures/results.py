@@ -27,9 +27,11 @@ def origin(name: str, result: dict[str, Any]) -> str:
     """Say where a table comes from."""
     machine, commit = result["machine"], result["git"]["commit"][:7]
     changed = ", changed tree" if result["git"]["dirty"] else ""
+    device = result.get("device", "cpu")
+    device = "" if device == "cpu" else f"one {device}, "
     return (
         f"\n`{result['command']}` → `benchmarks/results/{name}.json` "
-        f"(commit {commit}{changed}, {machine['cores']} cores of an {machine['cpu']})\n"
+        f"(commit {commit}{changed}, {device}{machine['cores']} cores of an {machine['cpu']})\n"
     )
 
 

@@ -179,12 +179,19 @@ def growth() -> str:
     return if_measured(_growth, "growth")
 
 
+def growth_gpu() -> str:
+    return if_measured(_sizes, "growth_gpu")
+
+
 def _growth(result: dict[str, Any]) -> str:
+    """The figure, and the tables below it."""
+    figure = f"![Steps a second against environments and against seeds]({FIGURE})\n\n"
+    return (figure if (ROOT / "docs" / FIGURE).is_file() else "") + _sizes(result)
+
+
+def _sizes(result: dict[str, Any]) -> str:
     """One row a world and one column a size: steps/s of TRPO, and of random actions below it."""
-    rows = result["rows"]
-    text = ""
-    if (ROOT / "docs" / FIGURE).is_file():
-        text = f"![Steps a second against environments and against seeds]({FIGURE})\n\n"
+    rows, text = result["rows"], ""
     for grows, what in (("envs", "environments"), ("seeds", "seeds of 50 environments")):
         chosen = [row for row in rows if row["grows"] == grows]
         sizes = sorted({row[grows] for row in chosen})

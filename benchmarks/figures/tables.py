@@ -323,6 +323,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "targets": speed_tables.targets,
     "start": speed_tables.start,
     "growth": speed_tables.growth,
+    "growth_gpu": speed_tables.growth_gpu,
     "seeds_together": speed_tables.seeds_together,
     "memory": speed_tables.memory,
     "flags": flags,
