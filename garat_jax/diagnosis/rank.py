@@ -165,7 +165,8 @@ def _counted(found: Selection, say: Callable[[str], None]):
 
     Returns:
         The problem, the steps that are left, their fit at a timestep of 0, the noise floor at the
-        model's own, and the fit that says most of what is left.
+        model's own, and the fit that says most of what is left; if no step is left, the fit and the
+        floor of all that was found.
     """
     problem, steps, current, timeless = found.problem, [*found.steps], found.fit, found.timeless
     floor = found.floor
@@ -178,9 +179,10 @@ def _counted(found: Selection, say: Callable[[str], None]):
             return problem, steps, counted, floor, counted
         steps = [step for step in steps if step is not nil]
         say(f"going on without {nil.candidate.named}")
-        current, timeless = fit_only(problem, current, [step.effect for step in steps]), None
-        steps = refitted(problem, steps, current) if steps else []
-        floor = noise_floor(problem, make_metric(problem), current)
+        if steps:
+            current, timeless = fit_only(problem, current, [step.effect for step in steps]), None
+            steps = refitted(problem, steps, current)
+            floor = noise_floor(problem, make_metric(problem), current)
     return problem, steps, current, floor, found.best
 
 
