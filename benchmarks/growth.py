@@ -2,7 +2,7 @@
 
 `python benchmarks/growth.py`: TRPO and random actions, the number of environments of one seed from
 1 to 4096, and the number of seeds with the presets' 50 environments each. The result is written
-anew after each world, so that a run that is cut off keeps those it has.
+anew after each world, so that a run that is cut off keeps those it has, and says which it lacks.
 """
 
 import dataclasses
@@ -75,7 +75,7 @@ def grow(name: str, grows: str, sizes: Sequence[Size], arguments: Arguments) -> 
 def main() -> None:
     arguments = tyro.cli(Arguments)
     rows: list[dict[str, Any]] = []
-    for name in arguments.envs:
+    for number, name in enumerate(arguments.envs, 1):
         by_envs = [size_of(1, num_envs) for num_envs in arguments.num_envs]
         by_seeds = [size_of(num_seeds, 50) for num_seeds in arguments.num_seeds]
         rows += grow(name, "envs", by_envs, arguments)
@@ -86,6 +86,7 @@ def main() -> None:
                 rows,
                 seeds=list(range(max(arguments.num_seeds))),
                 command=command_line(),
+                details={"not_measured": arguments.envs[number:]},
                 folder=arguments.out,
             )
         )

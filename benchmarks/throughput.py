@@ -3,7 +3,8 @@
 `python benchmarks/throughput.py`: iterations of TRPO and of PPO with the presets' settings; the
 same steps with random actions; C MuJoCo alone; and other libraries' TRPO and PPO with the same
 hyper-parameters in the same worlds. All are compiled and warm, and run in turns. The result is
-written anew after each world, so that a run that is cut off keeps those it has.
+written anew after each world, so that a run that is cut off keeps those it has, and says which it
+lacks.
 """
 
 import dataclasses
@@ -123,10 +124,11 @@ def show(row: dict[str, Any]) -> None:
 def main() -> None:
     arguments = tyro.cli(Arguments)
     rows, tried, costs = [], [], []
-    for name in arguments.envs:
+    for number, name in enumerate(arguments.envs, 1):
         for found, more in zip((rows, tried, costs), measure_world(name, arguments), strict=True):
             found += more
         details = {
+            "not_measured": arguments.envs[number:],
             "load_average_after": os.getloadavg(),
             "choices_of_the_peers": tried,
             "parts_of_a_trpo_iteration": costs,

@@ -52,7 +52,8 @@ class Examination:
 
     Attributes:
         facts: What it is and what it was found to be.
-        rates: The measurement: each engine, one simulation and many; on accelerators `MANY`, too.
+        rates: The measurement: each engine, one simulation and a batch; on accelerators MJX
+            with `MANY`, too.
         advice: What follows, one sentence each.
     """
 
@@ -73,21 +74,20 @@ def examine(device: str, seconds: float = SECONDS) -> Examination:
     """
     devices = use(device)
     platform = devices[0].platform
-    batches = (1, BATCH) if platform == "cpu" else (1, BATCH, MANY)
-    seconds /= len(ENGINES) * len(batches)
+    more = [] if platform == "cpu" else [("mjx", MANY)]
+    sizes = [*itertools.product(ENGINES, (1, BATCH)), *more]
     with Console(stderr=True).status("compiling and measuring"):
         prepared = {}
         with ThreadPoolExecutor() as pool:
-            for engine in reversed(ENGINES):  # MJX compiles longest: let it begin first
+            for engine, batch in reversed(sizes):  # MJX compiles longest: let it begin first
                 world = dynamics.compile(load_spec(PENDULUM), engine=engine)
-                for batch in batches:
-                    lowered, start = prepare(world, batch)
-                    options = compiler_options(world)
-                    prepared[engine, batch] = pool.submit(lowered.compile, options), start
+                lowered, start = prepare(world, batch)
+                options = compiler_options(world)
+                prepared[engine, batch] = pool.submit(lowered.compile, options), start
         rates = []
-        for engine, batch in itertools.product(ENGINES, batches):
+        for engine, batch in sizes:
             program, start = prepared[engine, batch]
-            rate = measure(program.result(), start, batch, seconds)
+            rate = measure(program.result(), start, batch, seconds / len(sizes))
             rates.append(Rate(engine, batch, rate))
     return Examination(facts(devices), rates, advise(rates, platform))
 
@@ -174,8 +174,8 @@ def advise(rates: list[Rate], platform: str) -> list[str]:
     if (auto, MANY) in rate:
         gain = rate[auto, MANY] / rate[auto, BATCH]
         advice.append(
-            f"{MANY} at once do {gain:.0f} times the steps of {BATCH}: the device pays with "
-            "thousands of environments; with fewer, time --device cpu as well."
+            f"{MANY} at once do {gain:.1f} times the steps of {BATCH}: it pays with many "
+            "environments; with few, time --device cpu as well."
         )
     cores = num_cores()
     if platform == "cpu" and cores > 1 and HOST_DEVICES not in os.environ.get("XLA_FLAGS", ""):

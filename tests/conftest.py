@@ -15,14 +15,21 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 # Tests compile more than they run: these halve the first, and cost a quarter of the second. A flag
 # that is gone, as the first is from jaxlib 0.11.1 on, ends the process.
-_flags = ["--xla_backend_optimization_level=1"]
-if tuple(int(number) for number in metadata.version("jaxlib").split(".")[:3]) < (0, 11, 1):
-    _flags.insert(0, "--xla_cpu_use_fusion_emitters=false")
-os.environ.setdefault("XLA_FLAGS", " ".join(_flags))
+KNOWS_EMITTERS = tuple(map(int, metadata.version("jaxlib").split(".")[:3])) < (0, 11, 1)
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_cpu_use_fusion_emitters=false " * KNOWS_EMITTERS + "--xla_backend_optimization_level=1",
+)
 compilation_cache.enable()
 # Shells have what they start in the background ignore Ctrl-C, and so would the programs that tests
 # interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session")
+def knows_emitters() -> bool:
+    """Whether the installed XLA has a switch for its fusion emitters."""
+    return KNOWS_EMITTERS
 
 
 @pytest.fixture(scope="session")

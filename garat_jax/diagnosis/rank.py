@@ -166,7 +166,7 @@ def _counted(found: Selection, say: Callable[[str], None]):
     Returns:
         The problem, the steps that are left, their fit at a timestep of 0, the noise floor at the
         model's own, and the fit that says most of what is left; if no step is left, the fit and the
-        floor of all that was found.
+        floor are still those with the last that went.
     """
     problem, steps, current, timeless = found.problem, [*found.steps], found.fit, found.timeless
     floor = found.floor
