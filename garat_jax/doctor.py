@@ -77,10 +77,11 @@ def examine(device: str, seconds: float = SECONDS) -> Examination:
     more = [] if platform == "cpu" else [("mjx", MANY)]
     sizes = [*itertools.product(ENGINES, (1, BATCH)), *more]
     with Console(stderr=True).status("compiling and measuring"):
+        worlds = {name: dynamics.compile(load_spec(PENDULUM), engine=name) for name in ENGINES}
         prepared = {}
         with ThreadPoolExecutor() as pool:
             for engine, batch in reversed(sizes):  # MJX compiles longest: let it begin first
-                world = dynamics.compile(load_spec(PENDULUM), engine=engine)
+                world = worlds[engine]
                 lowered, start = prepare(world, batch)
                 options = compiler_options(world)
                 prepared[engine, batch] = pool.submit(lowered.compile, options), start
@@ -174,8 +175,8 @@ def advise(rates: list[Rate], platform: str) -> list[str]:
     if (auto, MANY) in rate:
         gain = rate[auto, MANY] / rate[auto, BATCH]
         advice.append(
-            f"{MANY} at once do {gain:.1f} times the steps of {BATCH}: it pays with many "
-            "environments; with few, time --device cpu as well."
+            f"{MANY} at once do {gain:.1f} times the steps of {BATCH}: the device pays "
+            "with many environments; with few, time --device cpu as well."
         )
     cores = num_cores()
     if platform == "cpu" and cores > 1 and HOST_DEVICES not in os.environ.get("XLA_FLAGS", ""):

@@ -12,10 +12,8 @@ from tests.test_split import free_port
 
 
 def garat(*arguments: str) -> subprocess.CompletedProcess[str]:
-    program = "import sys; from garat_jax.cli import main; sys.exit(main())"
-    return subprocess.run(
-        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=120
-    )
+    program = [sys.executable, "-m", "garat_jax"]
+    return subprocess.run([*program, *arguments], capture_output=True, text=True, timeout=120)
 
 
 def assert_refused(done: subprocess.CompletedProcess[str], *parts: str) -> None:

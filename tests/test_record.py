@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks import record
 from benchmarks.record import command_line, write_result
 
 
@@ -27,6 +28,19 @@ def test_a_result_of_an_accelerator_is_named_after_it(tmp_path, monkeypatch):
     path = write_result("speed", [{}], seeds=[0], command="python x.py", folder=tmp_path)
     assert path == tmp_path / "speed_gpu.json"
     assert json.loads(path.read_text())["device"] == "NVIDIA H100"
+
+
+def test_a_result_written_anew_keeps_the_state_it_began_from(tmp_path, monkeypatch):
+    states = iter(("clean", "changed by the result"))
+    monkeypatch.setattr(record, "provenance", lambda: {"git": next(states)})
+    record._made_by.cache_clear()
+    for rate in (1.0, 2.0):
+        rows = [{"rate": rate}]
+        path = write_result("speed", rows, seeds=[0], command="python x.py", folder=tmp_path)
+    record._made_by.cache_clear()
+    result = json.loads(path.read_text())
+    assert result["rows"] == [{"rate": 2.0}]
+    assert result["git"] == "clean"
 
 
 @pytest.mark.parametrize("rows", [[], [{"rate": math.nan}]])

@@ -60,7 +60,8 @@ def choose_horizon(
         fitted = chosen.recording < (len(recordings) if num_fitted is None else num_fitted)
         if np.sum(fitted & chosen.is_whole) >= FEWEST_SEGMENTS:
             return horizon, chosen
-    return horizons[-1], cut(recordings, grid, horizons[-1])
+    shortest = horizons[-1]
+    return shortest, segments if len(horizons) == 1 else cut(recordings, grid, shortest)
 
 
 def warn_of_divergence(

@@ -9,6 +9,7 @@ from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Interval
 from garat_jax.diagnosis.judge import TOO_FEW, _at_end, is_certain, judge
 from garat_jax.diagnosis.metric import make_metric, noise_floor
+from garat_jax.diagnosis.problem import FEWEST_SEGMENTS
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
 from garat_jax.effects import CoggingTorque, GravityScale
@@ -84,8 +85,9 @@ def test_of_laws_that_both_reach_the_noise_the_simpler_counts(problem):
     assert first.passes
 
 
-@pytest.mark.parametrize(("num_fitted", "passes"), [(3, True), (2, False)])
-def test_nothing_passes_where_too_few_segments_are_fitted(problem, num_fitted, passes):
+@pytest.mark.parametrize(("missing", "passes"), [(0, True), (1, False)])
+def test_nothing_passes_where_too_few_segments_are_fitted(problem, missing, passes):
+    num_fitted = FEWEST_SEGMENTS - missing
     fitted = problem.fitted & (np.cumsum(problem.fitted) <= num_fitted)
     first, _ = judged(dataclasses.replace(problem, fitted=fitted), 0.7, 0.8)
     assert first.passes == passes
@@ -97,7 +99,7 @@ def test_nothing_passes_where_a_moment_is_held_out(problem):
     kept = np.union1d(np.flatnonzero(problem.fitted), held_out[:1])
     first, _ = judged(problem.take(kept), 0.7, 0.8)
     num_blocks = len(np.unique(problem.blocks()))
-    assert num_blocks < 3
+    assert num_blocks < FEWEST_SEGMENTS
     assert first.why == TOO_FEW
 
 
