@@ -32,6 +32,10 @@ def throughput() -> str:
     return if_measured(_throughput, "throughput")
 
 
+def throughput_gpu() -> str:
+    return if_measured(_throughput, "throughput_gpu")
+
+
 def _throughput(result: dict[str, Any]) -> str:
     """One row a side and one column a world: steps/s, and in brackets what it is compared with."""
     rows = result["rows"]

@@ -318,6 +318,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "transfer": transfer,
     "variants": variants,
     "throughput": speed_tables.throughput,
+    "throughput_gpu": speed_tables.throughput_gpu,
     "parts": speed_tables.parts,
     "learning": speed_tables.learning,
     "targets": speed_tables.targets,
