@@ -51,17 +51,20 @@ def choose_horizon(
     sample = grid.interval * grid.per_sample
     predicted = _perturbed(simulator, simulator.base, segments)
     growth, error = _growth(predicted, segments), _error(predicted[0], segments)
+
+    def cut_into(horizon: float) -> Segments:
+        return segments if horizon == horizons[0] else cut(recordings, grid, horizon)
+
     for horizon in horizons[:-1]:
         length = max(2, round(horizon / sample))
         grown, wrong = _lasting(growth[:, :length]), error[:, :length].max(axis=1)
         if not (_is_within(grown) and _is_within(wrong)):
             continue
-        chosen = segments if horizon == horizons[0] else cut(recordings, grid, horizon)
+        chosen = cut_into(horizon)
         fitted = chosen.recording < (len(recordings) if num_fitted is None else num_fitted)
         if np.sum(fitted & chosen.is_whole) >= FEWEST_SEGMENTS:
             return horizon, chosen
-    shortest = horizons[-1]
-    return shortest, segments if len(horizons) == 1 else cut(recordings, grid, shortest)
+    return horizons[-1], cut_into(horizons[-1])
 
 
 def warn_of_divergence(
