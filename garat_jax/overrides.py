@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from garat_jax.effects.base import OBJECT_TYPES
+from garat_jax.effects.elements import OBJECT_TYPES
 from garat_jax.errors import UserError, unknown_name
 
 

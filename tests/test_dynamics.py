@@ -360,7 +360,7 @@ def test_the_native_model_is_what_the_engine_steps():
     mujoco.mj_step(model, data, 5)
     state = dynamics.step(world, state, jnp.zeros(model.nu), 5)
     np.testing.assert_allclose(state.qpos, data.qpos, rtol=1e-9)
-    assert dynamics.view(world).host.body("forearm_payload").mass[0] < 1e-8
+    assert dynamics.view(world).host.body("payload of forearm").mass[0] < 1e-8
 
 
 def test_the_native_model_has_the_steady_part_of_a_varying_friction():

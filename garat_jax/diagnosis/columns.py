@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import mujoco
 
-from garat_jax.effects.base import DOFS_OF_JOINT, element_names
+from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
 from garat_jax.errors import UserError
 
 

@@ -32,8 +32,8 @@ from garat_jax.diagnosis.torque import TorqueError, compare_torques
 from garat_jax.diagnosis.units import after_number
 from garat_jax.diagnosis.unseen import STILL, is_still
 from garat_jax.dynamics import native_model
-from garat_jax.effects.base import element_names
 from garat_jax.effects.catalogue import Catalogue
+from garat_jax.effects.elements import element_names
 from garat_jax.provenance import versions
 from garat_jax.runs import RunDirectory, finite_or_null, to_plain
 

@@ -9,6 +9,7 @@ import mujoco
 
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.effects import Effect
+from garat_jax.effects.joint import TorqueOffset
 from garat_jax.effects.transmission import Transmission
 from garat_jax.errors import UserError
 
@@ -44,7 +45,7 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
         override.apply(spec)
     unsaid = tuple(
         line if effect.kind in line else f"{effect.kind} at {effect.target}: {line}"
-        for effect in sorted(model.effects, key=_is_link_side)
+        for effect in sorted(model.effects, key=_turn)
         if (line := effect.export(spec))
     )
     _point_at_assets(spec, model.mjcf.parent, path.parent)
@@ -64,9 +65,12 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
     return Exported(path, unsaid)
 
 
-def _is_link_side(effect: Effect) -> bool:
-    """Sort motors that leave their joint first: what else is at the joint stays there."""
-    return not isinstance(effect, Transmission)
+def _turn(effect: Effect) -> int:
+    """Sort motors that leave their joint first: what else is at the joint stays there.
+
+    A torque that an actuator's bias stands for comes last, when its gain and limit are final.
+    """
+    return 0 if isinstance(effect, Transmission) else 2 if isinstance(effect, TorqueOffset) else 1
 
 
 def needed_files(model: Model) -> list[Path]:

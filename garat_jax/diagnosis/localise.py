@@ -13,7 +13,7 @@ import numpy as np
 from scipy import signal
 
 from garat_jax.diagnosis.columns import signals, torques
-from garat_jax.effects.base import DOFS_OF_JOINT, element_names
+from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
 from garat_jax.effects.gear import gear_of
 from garat_jax.effects.units import at_slide
 

@@ -14,13 +14,19 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.columns import actuator_names, signals, torques
+from garat_jax.diagnosis.continuous import (
+    unwrapped,
+    with_continuous_quaternions,
+    wrapped_joints,
+)
 from garat_jax.diagnosis.filters import white_noise
 from garat_jax.diagnosis.maps import ColumnMap
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.oddities import oddities
 from garat_jax.diagnosis.tables import FEWEST_SAMPLES, Table, check_samples, read_table
-from garat_jax.diagnosis.velocity import estimate_velocity, quaternions
+from garat_jax.diagnosis.velocity import estimate_velocity
 from garat_jax.dynamics import native_model
+from garat_jax.effects.elements import quaternions
 from garat_jax.errors import UserError, nearest, unknown_name
 
 GAP = 5.0
@@ -85,7 +91,10 @@ class Recording:
         spans, warnings = _split(table.path, time)
         names = signals(model)
         qpos = _stack(columns, [s.name for s in names[: model.nq]], len(time))
-        qpos = _unit_quaternions(table, model, qpos)
+        qpos = with_continuous_quaternions(model, _unit_quaternions(table, model, qpos))
+        wrapped = wrapped_joints(model, qpos, spans)
+        qpos = unwrapped(model, qpos, wrapped)
+        warnings += [_said_of_wrapped(table.path, model, joint) for joint in wrapped]
         if velocity_measured:
             qvel = _stack(columns, [s.name for s in names[model.nq :]], len(time))
         else:
@@ -232,6 +241,11 @@ def _unit_quaternions(table: Table, model: mujoco.MjModel, qpos: np.ndarray) -> 
             )
         qpos[:, start : start + 4] /= norm[:, None]
     return qpos
+
+
+def _said_of_wrapped(path: Path, model: mujoco.MjModel, joint: int) -> str:
+    name = signals(model)[model.jnt_qposadr[joint]].name
+    return f"{path.name}: {name} jumps by a turn and is taken to go on turning"
 
 
 def _estimate(model: mujoco.MjModel, time, qpos, spans) -> np.ndarray:

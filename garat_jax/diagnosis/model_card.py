@@ -17,9 +17,9 @@ import numpy as np
 from garat_jax.diagnosis.own_effects import try_own
 from garat_jax.dynamics import Dynamics, Override, compile
 from garat_jax.effects import CATALOGUE, Effect
-from garat_jax.effects.base import element_names
 from garat_jax.effects.bounds import check_bounds
 from garat_jax.effects.catalogue import Catalogue, load_catalogue
+from garat_jax.effects.elements import element_names
 from garat_jax.env import Task, TaskEnv, Transform, World
 from garat_jax.errors import UserError, unknown_name
 from garat_jax.overrides import load_spec

@@ -14,7 +14,7 @@ from garat_jax.diagnosis.columns import actuator_names, signals
 from garat_jax.diagnosis.localise import missing_torque
 from garat_jax.diagnosis.units import UNITS
 from garat_jax.diagnosis.velocity import estimate_velocity
-from garat_jax.effects.base import DOFS_OF_JOINT
+from garat_jax.effects.elements import DOFS_OF_JOINT
 
 if TYPE_CHECKING:
     from garat_jax.diagnosis.measurements import Recording

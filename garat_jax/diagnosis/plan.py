@@ -22,7 +22,7 @@ from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
-from garat_jax.effects.base import DOFS_OF_JOINT, element_names
+from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
 from garat_jax.errors import UserError, choose, unknown_name
 from garat_jax.report import styled
 

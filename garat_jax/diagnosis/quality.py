@@ -15,7 +15,7 @@ from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.filters import quantum
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording, noise
-from garat_jax.effects.base import element_names
+from garat_jax.effects.elements import element_names
 
 LAGS = np.arange(-0.02, 0.1001, 0.0005)
 """Seconds among which the lag of commands is sought."""

@@ -7,8 +7,8 @@ import mujoco
 
 from garat_jax.diagnosis.findings import Candidate, Named
 from garat_jax.diagnosis.results import Experiment
-from garat_jax.effects.base import element_id
 from garat_jax.effects.contact import partners
+from garat_jax.effects.elements import element_id
 
 EXPERIMENTS: dict[frozenset[str], str] = {
     frozenset({"motor_gain", "payload_mass"}): (

@@ -3,8 +3,9 @@
 import mujoco
 import numpy as np
 
+from garat_jax.diagnosis.continuous import with_continuous_quaternions
 from garat_jax.diagnosis.filters import local_slope
-from garat_jax.effects.base import DOFS_OF_JOINT
+from garat_jax.effects.elements import DOFS_OF_JOINT
 
 
 def estimate_velocity(model: mujoco.MjModel, time: np.ndarray, qpos: np.ndarray) -> np.ndarray:
@@ -20,10 +21,7 @@ def estimate_velocity(model: mujoco.MjModel, time: np.ndarray, qpos: np.ndarray)
     Returns:
         Velocities, [T, nv].
     """
-    qpos = qpos.copy()
-    for start in quaternions(model):
-        flips = np.sign(np.sum(qpos[1:, start : start + 4] * qpos[:-1, start : start + 4], axis=1))
-        qpos[1:, start : start + 4] *= np.cumprod(np.where(flips < 0, -1.0, 1.0))[:, None]
+    qpos = with_continuous_quaternions(model, qpos)
     slope = local_slope(time, qpos)
     velocity = np.zeros((len(time), model.nv))
     for joint in range(model.njnt):
@@ -35,13 +33,6 @@ def estimate_velocity(model: mujoco.MjModel, time: np.ndarray, qpos: np.ndarray)
             at = slice(position + straight, position + straight + 4)
             velocity[:, dof + straight : dof + dofs] = _angular_velocity(qpos[:, at], slope[:, at])
     return velocity
-
-
-def quaternions(model: mujoco.MjModel) -> list[int]:
-    """List where the quaternions of ball and free joints start in `qpos`."""
-    extra = {int(mujoco.mjtJoint.mjJNT_BALL): 0, int(mujoco.mjtJoint.mjJNT_FREE): 3}
-    kinds = [int(kind) for kind in model.jnt_type]
-    return [int(model.jnt_qposadr[j]) + extra[k] for j, k in enumerate(kinds) if k in extra]
 
 
 def _angular_velocity(quaternion: np.ndarray, slope: np.ndarray) -> np.ndarray:

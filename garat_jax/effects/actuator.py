@@ -13,7 +13,9 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+from garat_jax.effects.at_joint import BIASES, GAINS
+from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
+from garat_jax.effects.elements import element_id
 from garat_jax.effects.gear import gear_in, gear_of
 from garat_jax.errors import UserError
 
@@ -99,6 +101,7 @@ class MotorGain(Effect):
 
     kind: ClassVar[str] = "motor_gain"
     elements: ClassVar[tuple[str, ...]] = ("actuator",)
+    needs: ClassVar[str] = "an actuator whose gain and bias are fixed or affine, as no muscle's are"
     law: ClassVar[str] = "τ = s·τ_model(u, q, q̇)"
     identified_by: ClassVar[str] = "commands of several sizes, with and without a known payload"
 
@@ -110,6 +113,15 @@ class MotorGain(Effect):
         scale=0.05,
         source="A motor that gives a tenth or three times its rated torque is another motor",
     )
+
+    @classmethod
+    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
+        """Say whether the actuator's force is in proportion to the numbers of its gain and bias."""
+        if not super().fits(host, element, name):
+            return False
+        index = element_id(host, "actuator", name)
+        is_plain = host.actuator_gaintype[index] in GAINS
+        return bool(is_plain and host.actuator_biastype[index] in BIASES)
 
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Scale the actuator's whole gain and bias, and the range of its force."""
@@ -226,9 +238,7 @@ class BackEmf(Effect):
         """Say whether the actuator's bias is affine or can be made so."""
         if not super().fits(host, element, name):
             return False
-        index = element_id(host, "actuator", name)
-        affine = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
-        return int(host.actuator_biastype[index]) in [int(bias) for bias in affine]
+        return host.actuator_biastype[element_id(host, "actuator", name)] in BIASES
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Give the actuator an affine bias, of zero where it had none."""
@@ -251,8 +261,7 @@ class BackEmf(Effect):
 
 def can_bias(actuator: mujoco.MjsActuator) -> bool:
     """Say whether an actuator's bias can add to its force unchecked."""
-    affine = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
-    return actuator.biastype in affine and not _has_forcerange(actuator)
+    return actuator.biastype in BIASES and not _has_forcerange(actuator)
 
 
 def make_affine(actuator: mujoco.MjsActuator) -> None:

@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from garat_jax.errors import UserError, unknown_name
+from garat_jax.effects.elements import DOFS_OF_JOINT, OBJECT_TYPES, element_id, element_names
+from garat_jax.errors import UserError
 
 Named = TypeVar("Named")
 
@@ -87,40 +88,6 @@ class ModelView:
         index = element_id(self.host, "joint", joint)
         start = self.host.jnt_dofadr[index]
         return np.arange(start, start + DOFS_OF_JOINT[self.host.jnt_type[index]])
-
-
-DOFS_OF_JOINT = {
-    int(mujoco.mjtJoint.mjJNT_FREE): 6,
-    int(mujoco.mjtJoint.mjJNT_BALL): 3,
-    int(mujoco.mjtJoint.mjJNT_SLIDE): 1,
-    int(mujoco.mjtJoint.mjJNT_HINGE): 1,
-}
-
-OBJECT_TYPES = {
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "joint": mujoco.mjtObj.mjOBJ_JOINT,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-}
-COUNTS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "actuator": "nu"}
-
-
-def element_names(host: mujoco.MjModel, element: str) -> list[str]:
-    """List the names of a model's bodies, joints, geoms or actuators; nameless ones are ''."""
-    kind = OBJECT_TYPES[element]
-    return [mujoco.mj_id2name(host, kind, i) or "" for i in range(getattr(host, COUNTS[element]))]
-
-
-def element_id(host: mujoco.MjModel, element: str, name: str) -> int:
-    """Return an element's index.
-
-    Raises:
-        UserError: The model has no such element; the message names the nearest ones.
-    """
-    names = element_names(host, element)
-    if name not in names:
-        raise unknown_name(element, name, [known for known in names if known])
-    return names.index(name)
 
 
 @struct.dataclass

@@ -9,8 +9,10 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from garat_jax.effects.base import Effect, ModelView, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, parameter
+from garat_jax.effects.elements import element_id, element_names, free_name
 from garat_jax.effects.kinematics import centre_of_mass_jacobian
+from garat_jax.errors import UserError
 
 SMALLEST_MASS = 1e-9
 """Mass [kg] and inertia [kg m²] of the payload's body when the model is compiled."""
@@ -52,13 +54,26 @@ class PayloadMass(Effect):
 
     @property
     def payload(self) -> str:
-        """The name of the payload's own body."""
-        return f"{self.name}_payload"
+        """The name of the payload's own body, which no exported model has."""
+        return f"payload of {self.name}"
 
     @classmethod
     def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
         """Say whether the body moves."""
         return bool(name) and moves(host, name)
+
+    def check(self, host: mujoco.MjModel) -> None:
+        """Check also that the body carries no other.
+
+        Raises:
+            UserError: As `Effect.check`, or there is a payload at the body already.
+        """
+        super().check(host)
+        if self.payload in element_names(host, "body"):
+            raise UserError(
+                f"there is a payload_mass at {self.target} already; one point mass stands for all "
+                "that the body carries: change that one"
+            )
 
     @classmethod
     def at(cls, host: mujoco.MjModel, target: str) -> Mapping[str, float]:
@@ -80,7 +95,7 @@ class PayloadMass(Effect):
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Weld a body of negligible mass to the target, which the compiler may not fuse."""
-        self._add_body(spec, [0.0, 0.0, 0.0], SMALLEST_MASS).fuse = False
+        self._add_body(spec, self.payload, [0.0, 0.0, 0.0], SMALLEST_MASS).fuse = False
 
     def fields(self, model: ModelView) -> dict[str, jax.Array]:
         """Give the payload's body its mass and place, whatever bounds the compiler set."""
@@ -94,12 +109,13 @@ class PayloadMass(Effect):
     def export(self, spec: mujoco.MjSpec) -> str:
         """Add the payload as a body with an inertial of its own."""
         if float(self.mass) > 0:
-            self._add_body(spec, [float(v) for v in _vector(self)], float(self.mass))
+            name = free_name(f"{self.name}_payload", spec.body)
+            self._add_body(spec, name, [float(v) for v in _vector(self)], float(self.mass))
         return ""
 
-    def _add_body(self, spec: mujoco.MjSpec, place: list[float], mass: float) -> Any:
+    def _add_body(self, spec: mujoco.MjSpec, name: str, place: list[float], mass: float) -> Any:
         return spec.body(self.name).add_body(
-            name=self.payload,
+            name=name,
             pos=place,
             ipos=[0.0, 0.0, 0.0],
             explicitinertial=True,

@@ -11,7 +11,8 @@ from pathlib import Path
 from types import ModuleType
 
 from garat_jax.effects import CATALOGUE
-from garat_jax.effects.base import OBJECT_TYPES, Effect
+from garat_jax.effects.base import Effect
+from garat_jax.effects.elements import OBJECT_TYPES
 from garat_jax.errors import UserError
 
 ENTRY_POINTS = "garat_jax.effects"

@@ -10,7 +10,8 @@ import numpy as np
 from flax import struct
 
 from garat_jax.effects.actuator import A_MOTOR, clamped, is_motor, largest_command
-from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
+from garat_jax.effects.elements import element_id
 
 PARTS_OF_COMMAND = (0.01, 0.05, 0.2)
 """Parts of the largest command at which a dead band is tried."""
@@ -194,11 +195,10 @@ class ActuatorDelay(Effect):
         return ctrl.at[late].set(delayed.astype(ctrl.dtype)), None, (past, count + 1)
 
     def export(self, spec: mujoco.MjSpec) -> str:
-        """Give the actuators MuJoCo's own delay, with a buffer that is long enough."""
-        substeps = int(np.ceil(float(self.delay) / spec.option.timestep))
+        """Add to the actuators' delay of MuJoCo's own, with a buffer that is long enough."""
         for actuator in spec.actuators:
             if float(self.delay) > 0 and self.target in ("all", f"actuator/{actuator.name}"):
-                actuator.delay = float(self.delay)
-                actuator.nsample = substeps + 2
+                actuator.delay += float(self.delay)
+                actuator.nsample = int(np.ceil(actuator.delay / spec.option.timestep)) + 2
                 actuator.interp = 1
         return "MuJoCo's delay holds 0 before the first command, and MJX does not step it"

@@ -16,7 +16,8 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from garat_jax.effects.base import Effect, ModelView, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, parameter
+from garat_jax.effects.elements import element_id
 
 FLAT = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 """Geoms that cannot touch each other."""

@@ -16,7 +16,8 @@ import mujoco
 from flax import struct
 
 from garat_jax.effects.at_joint import actuator_torque, at_dof, felt_inertia, is_driven
-from garat_jax.effects.base import Effect, ModelView, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, parameter
+from garat_jax.effects.elements import element_id
 
 SMALLEST_FRICTION = 1e-9
 """Friction loss [N m] that makes MuJoCo reserve a constraint row without being felt."""

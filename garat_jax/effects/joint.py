@@ -13,7 +13,8 @@ from scipy import optimize, signal
 
 from garat_jax.effects.actuator import can_bias, make_affine
 from garat_jax.effects.at_joint import at_dof
-from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
+from garat_jax.effects.elements import element_id
 from garat_jax.effects.most import follow_most, median_distance
 
 BINS_PER_PERIOD = 4
@@ -92,12 +93,16 @@ class TorqueOffset(Effect):
         return ctrl, at_dof(model.host, joint, self.torque, ctrl.dtype), memory
 
     def export(self, spec: mujoco.MjSpec) -> str:
-        """Add to the bias of an unlimited actuator at the joint, if there is one."""
+        """Add to the bias of an unlimited actuator at an unlimited joint, if there is one."""
+        joint = spec.joint(self.name)
+        is_clamped = joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_TRUE or (
+            joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_AUTO and np.any(joint.actfrcrange)
+        )
         for actuator in spec.actuators:
             at_joint = (
                 actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == self.name
             )
-            if at_joint and can_bias(actuator):
+            if at_joint and not is_clamped and can_bias(actuator):
                 make_affine(actuator)
                 actuator.biasprm[0] += float(self.torque) / actuator.gear[0]
                 return ""

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.effects.at_joint import drivers
+from garat_jax.effects.elements import free_name
 
 NEGLIGIBLE = 1e-9
 """Mass [kg] and inertia [kg m²] of the motor's body, whose inertia is its joint's armature."""
@@ -15,7 +16,7 @@ NEGLIGIBLE = 1e-9
 
 def add_motor(spec: mujoco.MjSpec, host: mujoco.MjModel, name: str, inertia: float) -> str:
     """Move a joint's motor, with its actuators and keyframes, to a body; return that one's name."""
-    joint, motor = spec.joint(name), f"{name}_motor"
+    joint, motor = spec.joint(name), free_name(f"{name}_motor", spec.body, spec.joint)
     index = host.joint(name).id
     link = host.jnt_bodyid[index]
     body = joint.parent.parent.add_body(
@@ -50,7 +51,8 @@ def add_motor(spec: mujoco.MjSpec, host: mujoco.MjModel, name: str, inertia: flo
 
 def add_gear(spec: mujoco.MjSpec, joint: str, motor: str) -> mujoco.MjsTendon:
     """Return a new tendon, idle so far, whose length is the motor's angle less the joint's."""
-    gear = spec.add_tendon(name=f"{joint}_gear", limited=mujoco.mjtLimited.mjLIMITED_FALSE)
+    name = free_name(f"{joint}_gear", spec.tendon)
+    gear = spec.add_tendon(name=name, limited=mujoco.mjtLimited.mjLIMITED_FALSE)
     for unset in ("stiffness", "damping", "frictionloss", "armature", "margin"):
         setattr(gear, unset, 0.0 * np.asarray(getattr(gear, unset)))
     gear.springlength = [0.0, 0.0]

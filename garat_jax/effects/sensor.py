@@ -14,6 +14,7 @@ from flax import struct
 
 from garat_jax.effects.base import Effect, parameter
 from garat_jax.effects.command import ActuatorDelay
+from garat_jax.effects.elements import quaternions
 
 
 @struct.dataclass
@@ -144,11 +145,3 @@ class SensorDelay(Effect):
     def as_replayed(self) -> Effect:
         """Return late commands: seen from sensors that are late, the commands are."""
         return ActuatorDelay(target="all", delay=self.delay)
-
-
-def quaternions(host: mujoco.MjModel) -> list[int]:
-    """Return where in qpos the quaternions of ball and free joints start."""
-    kinds = mujoco.mjtJoint
-    offset = {int(kinds.mjJNT_FREE): 3, int(kinds.mjJNT_BALL): 0}
-    joints = zip(host.jnt_type, host.jnt_qposadr, strict=True)
-    return [int(start) + offset[kind] for kind, start in joints if kind in offset]

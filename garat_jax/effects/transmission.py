@@ -18,7 +18,8 @@ import numpy as np
 from flax import struct
 
 from garat_jax.effects.at_joint import actuator_torque, at_dof, feedback, is_driven
-from garat_jax.effects.base import Effect, ModelView, Suggestion, element_id, parameter
+from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
+from garat_jax.effects.elements import element_id
 from garat_jax.effects.motor_body import add_gear, add_motor
 from garat_jax.errors import UserError
 

@@ -2,7 +2,8 @@
 
 import mujoco
 
-from garat_jax.effects.base import Parameter, element_id
+from garat_jax.effects.base import Parameter
+from garat_jax.effects.elements import element_id
 from garat_jax.effects.gear import pushes
 
 

@@ -95,6 +95,68 @@ def test_a_motor_leaves_its_joint_before_other_effects_come(tmp_path):
     assert armature == pytest.approx({"elbow": 0.02, "elbow_motor": 0.01})
 
 
+def push(folder, effects, mjcf=models.ARM):
+    """Torque of the exported elbow's motor at rest, without a command, and what is left unsaid."""
+    (folder / "model.xml").write_text(mjcf)
+    model = load_model(folder / "model.xml")
+    exported = export_mjcf(
+        load_model(save_card(folder / "card.toml", model, effects)), folder / "out.xml"
+    )
+    plain = mujoco.MjModel.from_xml_path(str(exported.path))
+    data = mujoco.MjData(plain)
+    mujoco.mj_forward(plain, data)
+    return data.qfrc_actuator[plain.joint("elbow").dofadr[0]], exported.unsaid
+
+
+def test_an_offset_is_whole_whatever_the_motor_lost(tmp_path):
+    offset = CATALOGUE["torque_offset"](target="joint/elbow", torque=1.0)
+    gain = CATALOGUE["motor_gain"](target="actuator/elbow", scale=0.5)
+    assert push(tmp_path, [offset, gain]) == (pytest.approx(1.0), ())
+
+
+def test_an_offset_that_a_limit_would_cut_is_said(tmp_path):
+    offset = CATALOGUE["torque_offset"](target="joint/elbow", torque=1.0)
+    limit = CATALOGUE["torque_saturation"](target="actuator/elbow", limit=0.5)
+    clamped = models.ARM.replace('armature="0.01"', 'armature="0.01" actuatorfrcrange="-0.5 0.5"')
+    for torque, unsaid in (push(tmp_path, [offset, limit]), push(tmp_path, [offset], clamped)):
+        assert torque == 0.0
+        assert "no unlimited actuator" in unsaid[0]
+
+
+def test_delays_add_up(tmp_path):
+    model = load_model(write(tmp_path))
+    delay = CATALOGUE["actuator_delay"]
+    effects = [delay(target="all", delay=0.03), delay(target="actuator/elbow", delay=0.011)]
+    card = load_model(save_card(tmp_path / "late.toml", model, effects))
+    plain = mujoco.MjModel.from_xml_path(str(export_mjcf(card, tmp_path / "late.xml").path))
+    assert plain.actuator_delay.tolist() == pytest.approx([0.03, 0.041])
+    assert plain.actuator_history[:, 0].tolist() == [17, 23]
+
+
+def test_an_exported_payload_may_have_another(tmp_path):
+    payload = CATALOGUE["payload_mass"](target="body/forearm", mass=0.2)
+    model = load_model(write(tmp_path))
+    for number in ("1", "2"):
+        card = load_model(save_card(tmp_path / f"{number}.toml", model, [payload]))
+        model = load_model(export_mjcf(card, tmp_path / f"{number}.xml").path)
+    plain = mujoco.MjModel.from_xml_path(str(model.path))
+    assert plain.body("forearm_payload").mass[0] == plain.body("forearm_payload_2").mass[0] == 0.2
+    twice = load_model(save_card(tmp_path / "twice.toml", model, [payload, payload]))
+    with pytest.raises(UserError, match="a payload_mass at body/forearm already"):
+        twice.compile()
+
+
+def test_a_motor_takes_a_name_that_is_free(tmp_path):
+    taken = models.ARM.replace('name="upper"', 'name="elbow_motor"')
+    tendon = '<fixed name="elbow_gear"><joint joint="elbow" coef="1"/></fixed>'
+    taken = taken.replace("<actuator>", f"<tendon>{tendon}</tendon><actuator>")
+    flexible = CATALOGUE["joint_flexibility"](target="joint/elbow", stiffness=6.0)
+    push(tmp_path, [flexible], taken)
+    plain = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    assert plain.joint("elbow_motor_2").type[0] == mujoco.mjtJoint.mjJNT_HINGE
+    assert plain.tendon("elbow_gear_2").stiffness[0] == pytest.approx(6.0)
+
+
 @pytest.mark.slow  # a program a kind; tests/effects has the kinds one by one
 @pytest.mark.parametrize("kind", CATALOGUE)
 def test_what_mjcf_can_say_is_the_same_physics(tmp_path, kind):

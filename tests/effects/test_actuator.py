@@ -23,7 +23,7 @@ from garat_jax.effects import (
 from garat_jax.effects.actuator import MINITAUR_CURVE
 from garat_jax.errors import UserError
 from tests.effects.truth import RIG, SERVO
-from tests.models import PENDULUM, SLIDER, spec
+from tests.models import MUSCLE, PENDULUM, SLIDER, spec
 
 MOTOR = "actuator/motor"
 
@@ -245,3 +245,14 @@ def test_an_actuator_has_the_units_of_what_it_drives(kind, at_hinge, at_slide):
     ):
         host = spec(mjcf).compile()
         assert [unit_at(p, host, target) for p in CATALOGUE[kind].parameters()] == units
+
+
+def test_a_muscle_has_no_gain_in_proportion_to_its_numbers():
+    changed = spec(MUSCLE)
+    changed.actuators[0].name = "biceps"
+    host = changed.compile()
+    assert MotorGain.targets(host) == BackEmf.targets(host) == []
+    assert TorqueSaturation.targets(host) == ["actuator/biceps"]
+    with pytest.raises(UserError, match="fixed or affine, as no muscle's are"):
+        MotorGain("actuator/biceps", scale=1.5).check(host)
+    assert MotorGain.targets(spec(SERVO).compile()) == [MOTOR]

@@ -1,0 +1,60 @@
+"""Measured rotations without the jumps of how they are written: ±q of a quaternion, ±π of an angle.
+
+A quaternion and its negative are one rotation, and loggers that keep w ≥ 0 change its sign on the
+way. Encoders of a joint that turns round and round begin anew after a turn.
+"""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from garat_jax.effects.elements import quaternions
+
+TURN = 2 * np.pi
+WRITTEN_OVER = 1.001
+"""Turns that a wrapped angle is written over, at most; an encoder's last step may be a bit more."""
+JUMP = 0.75
+"""Turns that it jumps between two samples, at least."""
+
+
+def with_continuous_quaternions(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Return positions [T, nq] with each quaternion's sign as in the sample before."""
+    qpos = qpos.copy()
+    for start in quaternions(model):
+        there = slice(start, start + 4)
+        flips = np.sum(qpos[1:, there] * qpos[:-1, there], axis=1) < 0
+        qpos[1:, there] *= np.cumprod(np.where(flips, -1.0, 1.0))[:, None]
+    return qpos
+
+
+def wrapped_joints(
+    model: mujoco.MjModel, qpos: np.ndarray, spans: Sequence[tuple[int, int]]
+) -> list[int]:
+    """List the hinges whose angle is written within one turn and jumps by most of it.
+
+    Of those that can turn that far: a joint whose range is a turn or less does not wrap.
+
+    Args:
+        model: The model.
+        qpos: Positions, [T, nq].
+        spans: Index ranges [start, stop) without gaps, across which nothing jumps.
+    """
+    found = []
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
+        low, high = model.jnt_range[joint]
+        angle = qpos[:, model.jnt_qposadr[joint]]
+        can_turn = not model.jnt_limited[joint] or high - low > TURN
+        if can_turn and np.ptp(angle) <= WRITTEN_OVER * TURN:
+            jumps = max(np.abs(np.diff(angle[a:b])).max() for a, b in spans)
+            if jumps > JUMP * TURN:
+                found.append(int(joint))
+    return found
+
+
+def unwrapped(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int]) -> np.ndarray:
+    """Return positions [T, nq] in which the angles of some hinges count turns."""
+    qpos = qpos.copy()
+    places = model.jnt_qposadr[list(joints)]
+    qpos[:, places] = np.unwrap(qpos[:, places], axis=0)
+    return qpos
