@@ -5,6 +5,7 @@ fit left of the residual. Evidence is robust, with blocks of time as the indepen
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -58,36 +59,62 @@ def find_drifts(
     found = []
     for place, j in enumerate(free):
         both = np.concatenate([constant, growing[..., place : place + 1]], axis=2)
-        change, p_value, share, half = _slope(tall(both), residual.ravel(), labels)
-        if p_value * len(free) < SIGNIFICANCE and share > SMALLEST_SHARE:
-            found.append((p_value, _named(problem, fitted, j, change, half, p_value, share)))
+        line = _line(tall(both), residual.ravel(), labels, place)
+        if line.p_value * len(free) < SIGNIFICANCE and line.share > SMALLEST_SHARE:
+            found.append((line.p_value, _named(problem, fitted, j, line)))
     return tuple(drift for _, drift in sorted(found, key=lambda pair: pair[0]))
 
 
-def _slope(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray):
-    """Return the last column's coefficient, its p-value, the share it explains, its half width."""
+class _Line(NamedTuple):
+    """A parameter along a recording.
+
+    Attributes:
+        middle: What comes to its estimate in the middle of a recording: what is fitted may lie
+            before or after.
+        change: From start to end.
+        half: Half of the 95 % interval of that.
+        p_value: Of there being none.
+        share: Of the residual's squares that it explains.
+    """
+
+    middle: float
+    change: float
+    half: float
+    p_value: float
+    share: float
+
+
+def _line(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray, place: int) -> _Line:
+    """Regress a residual on the parameters and, the last column, one of them times the time.
+
+    Args:
+        columns: Of the constant parameters, then of the growing one, [M, k + 1].
+        residual: What is to be explained, [M].
+        labels: Blocks of time, [M].
+        place: Which of the constants grows.
+    """
     without = regress(columns[:, :-1], residual, labels).rest
     found = regress(columns, residual, labels)
     change, deviation = found.coefficient[-1], np.sqrt(found.covariance[-1, -1])
     p_value = 2.0 * float(stats.t.sf(abs(change) / max(deviation, 1e-300), found.freedom))
     share = 1.0 - float(found.rest @ found.rest) / max(float(without @ without), 1e-300)
     half = float(stats.t.ppf(0.975, found.freedom) * deviation)
-    return float(change), p_value, share, half
+    return _Line(float(found.coefficient[place]), float(change), half, p_value, share)
 
 
-def _named(problem: Problem, fitted: Fit, j: int, change, half, p_value, share) -> Drift:
+def _named(problem: Problem, fitted: Fit, j: int, line: _Line) -> Drift:
     simulator = problem.simulator
     slot = simulator.slots[j]
     effect = simulator.effects[slot.effect]
     unit = unit_at(slot.parameter, simulator.host, effect.target)
-    middle = float(fitted.theta[j])
+    middle, change = float(fitted.theta[j]) + line.middle, line.change
     return Drift(
         effect=effect.kind,
         target=effect.target,
         parameter=slot.parameter.name,
         begin=middle - change / 2,
         end=middle + change / 2,
-        change=Estimate(change, change - half, change + half, unit),
-        p_value=p_value,
-        share=share,
+        change=Estimate(change, change - line.half, change + line.half, unit),
+        p_value=line.p_value,
+        share=line.share,
     )

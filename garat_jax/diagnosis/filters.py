@@ -9,6 +9,29 @@ FEWEST = 5
 """Samples in that window at least."""
 ORDERS = (2, 4)
 """Orders of the differences that tell noise from motion."""
+UNIFORM = 0.01
+"""Largest deviation of a sampling interval, relative to their median, that counts as uniform."""
+ROWS = 10_000
+"""Samples around which polynomials are fitted at once: each has a window of its own in memory."""
+
+
+def even_steps(time: np.ndarray) -> np.ndarray:
+    """Return times [T] at even steps, which filters for uniform sampling need; given ones if so."""
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    if np.abs(steps - usual).max() <= UNIFORM * usual:
+        return time
+    return np.linspace(time[0], time[-1], round((time[-1] - time[0]) / usual) + 1)
+
+
+def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values [T, N], linear between their samples, at other times, [M, N]."""
+    return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
+
+
+def held(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values [T, N], held until their next sample, at other times, [M, N]."""
+    return values[np.searchsorted(time, at, side="right") - 1]
 
 
 def local_slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -27,9 +50,17 @@ def local_slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     num = len(time)
     half = max(FEWEST // 2, round(0.5 * WINDOW / float(np.median(np.diff(time)))))
     width = min(2 * half + 1, num)
-    first = np.clip(np.arange(num) - half, 0, num - width)
+    parts = np.array_split(np.arange(num), -(-num // ROWS))
+    return np.concatenate([_slope_at(rows, time, values, half, width) for rows in parts])
+
+
+def _slope_at(
+    rows: np.ndarray, time: np.ndarray, values: np.ndarray, half: int, width: int
+) -> np.ndarray:
+    """Return the derivatives at some samples, [rows, N]."""
+    first = np.clip(rows - half, 0, len(time) - width)
     index = first[:, None] + np.arange(width)
-    offset = time[index] - time[:, None]
+    offset = time[index] - time[rows, None]
     reach = np.abs(offset).max(axis=1, keepdims=True)
     offset = offset / reach
     weight = (1 - np.minimum(np.abs(offset) * width / (width + 1), 1) ** 3) ** 3

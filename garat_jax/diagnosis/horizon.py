@@ -48,7 +48,6 @@ def choose_horizon(
     """
     horizons = _possible(recordings)
     segments = cut(recordings, grid, horizons[0])
-    sample = grid.interval * grid.per_sample
     predicted = _perturbed(simulator, simulator.base, segments)
     growth, error = _growth(predicted, segments), _error(predicted[0], segments)
 
@@ -56,8 +55,9 @@ def choose_horizon(
         return segments if horizon == horizons[0] else cut(recordings, grid, horizon)
 
     for horizon in horizons[:-1]:
-        length = max(2, round(horizon / sample))
-        grown, wrong = _lasting(growth[:, :length]), error[:, :length].max(axis=1)
+        steps = max(2, round(horizon / grid.interval))
+        grown = _lasting(growth, segments.place, steps)
+        wrong = np.where(segments.place < steps, error, 0.0).max(axis=1)
         if not (_is_within(grown) and _is_within(wrong)):
             continue
         chosen = cut_into(horizon)
@@ -93,7 +93,7 @@ def warn_of_divergence(
     diverges, samples = _gone(predicted, halved, segments)
     if not np.any(diverges):
         return ()
-    seconds = samples * grid.interval * grid.per_sample
+    seconds = segments.place[np.arange(len(samples)), samples] * grid.interval
     early = np.mean(diverges & (seconds <= HORIZONS[-1]))
     when = (
         f"the model diverges within {np.median(seconds[diverges]):.2g} s of a measured state at a "
@@ -201,7 +201,8 @@ def _predictable(
         segments = segments.take(np.isin(segments.recording, chosen))
         if segments.measured.shape[1] <= problem.segments.measured.shape[1]:
             break
-        growth = _lasting(_growth(_perturbed(problem.simulator, theta, segments), segments))
+        growth = _growth(_perturbed(problem.simulator, theta, segments), segments)
+        growth = _lasting(growth, segments.place, int(segments.place.max()) + 1)
         if _is_within(growth):
             seen = np.isin(segments.recording, fitted)
             yield dataclasses.replace(problem, segments=segments, fitted=seen), growth
@@ -234,12 +235,12 @@ def _growth(predicted: np.ndarray, segments: Segments) -> np.ndarray:
     return growth / LARGEST_GROWTH
 
 
-def _lasting(growth: np.ndarray) -> np.ndarray:
-    """Return the largest growth [S, L] in the second half of each segment, [S].
+def _lasting(growth: np.ndarray, place: np.ndarray, steps: int) -> np.ndarray:
+    """Return the largest growth [S, L] in the second half of the first steps of each segment, [S].
 
     A stiff servo answers a small push with a fast motion that soon dies out, and fits stay linear.
     """
-    return growth[:, growth.shape[1] // 2 :].max(axis=1)
+    return np.where((place >= steps // 2) & (place < steps), growth, 0.0).max(axis=1)
 
 
 def _gone(

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import signal
 
 from garat_jax.diagnosis.columns import signals, torques
+from garat_jax.diagnosis.filters import even_steps, held, interpolated
 from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
 from garat_jax.effects.gear import gear_of
 from garat_jax.effects.units import at_slide
@@ -166,20 +167,23 @@ def _features(m: MissingTorque, dof: int):
 
 
 def _of_span(model: mujoco.MjModel, recording: "Recording", span: slice):
-    """Return the columns of `MissingTorque` for one span of one recording."""
-    time = recording.time[span]
+    """Return the columns of `MissingTorque` for one span of one recording, at even steps."""
+    time = even_steps(recording.time[span])
+    sampled = recording.time[span]
+    qpos = interpolated(time, sampled, recording.qpos[span])
+    velocity = interpolated(time, sampled, recording.qvel[span])
+    ctrl = held(time, sampled, recording.ctrl[span])
     interval = float(np.median(np.diff(time)))
     size = max(5, 2 * round(0.5 * WINDOW / interval) + 1)
     size = min(size, len(time) - 1 + len(time) % 2)
-    velocity = recording.qvel[span]
     acceleration = signal.savgol_filter(velocity, size, 2, deriv=1, delta=interval, axis=0)
     speed = signal.savgol_filter(velocity, size, 2, axis=0)
     data = mujoco.MjData(model)
     gears = np.asarray([gear_of(model, actuator) for actuator in range(model.nu)])
     rows = []
     for k in range(len(time)):
-        data.qpos[:], data.qvel[:] = recording.qpos[span][k], speed[k]
-        data.qacc[:], data.ctrl[:] = acceleration[k], recording.ctrl[span][k]
+        data.qpos[:], data.qvel[:] = qpos[k], speed[k]
+        data.qacc[:], data.ctrl[:] = acceleration[k], ctrl[k]
         mujoco.mj_inverse(model, data)
         needed, load = data.qfrc_inverse.copy(), data.qfrc_bias.copy()
         contact = _contact_torque(model, data)
@@ -189,10 +193,10 @@ def _of_span(model: mujoco.MjModel, recording: "Recording", span: slice):
     needed, load, contact, given, drive = (np.asarray(c) for c in zip(*rows, strict=True))
     both = signal.savgol_filter(np.hstack([given, drive]), size, 2, axis=0)
     given, drive = both[:, : model.nv], both[:, model.nv :]
-    position = _positions(model, recording.qpos[span])
+    position = _positions(model, qpos)
     edge = slice(size // 2, len(time) - size // 2)
     of_dofs = (time, position, speed, acceleration, given, load, contact, needed - given)
-    columns = (*of_dofs, recording.ctrl[span], drive)
+    columns = (*of_dofs, ctrl, drive)
     return tuple(column[edge] for column in columns)
 
 

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
-from scipy import signal as filters
+from scipy import signal
 
 from garat_jax.diagnosis.columns import signals
-from garat_jax.diagnosis.filters import quantum
+from garat_jax.diagnosis.filters import even_steps, held, quantum
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.effects.elements import element_names
@@ -138,12 +138,14 @@ def _lag(parts: list[tuple[Recording, MissingTorque]], index: int, dof: int, gai
     lags = LAGS + 0.5 * interval
     for part, m in parts:
         (a, b) = part.spans[0]
-        size = min(max(5, 2 * round(0.03 / interval) + 1), b - a - 1 + (b - a) % 2)
-        smooth = gain * np.asarray(filters.savgol_filter(part.ctrl[a:b, index], size, 2))
+        time = even_steps(part.time[a:b])
+        command = held(time, part.time[a:b], part.ctrl[a:b, [index]])[:, 0]
+        size = min(max(5, 2 * round(0.03 / interval) + 1), len(time) - 1 + len(time) % 2)
+        smooth = gain * np.asarray(signal.savgol_filter(command, size, 2))
         within = (m.time > m.time[0] + LAGS[-1]) & (m.time < m.time[-1] + LAGS[0])
         if within.sum() < 3 * FEATURES:
             continue
-        at, time = m.time[within], part.time[a:b]
+        at = m.time[within]
         target = m.torque[within, dof] + np.interp(at, time, smooth)
         basis = np.linalg.qr(_nuisances(m, dof)[within])[0]
         target = target - basis @ (basis.T @ target)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import integrate, optimize
 
+from garat_jax.diagnosis.filters import UNIFORM
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.errors import UserError
 
@@ -17,8 +18,6 @@ WARM_UP = 0.1
 """Seconds of commands before each segment: they fill delays and activations (at most 0.1 s)."""
 LONGEST_GAP = 1.0
 """Seconds that a gap in a recording counts at most, for what is remembered of before it."""
-UNIFORM = 0.01
-"""Largest deviation of a sampling interval, relative to their median, that counts as uniform."""
 SHORTEST = 10
 """Samples that a segment must have."""
 SLOWEST = 0.5
@@ -80,8 +79,8 @@ class Segments:
     @property
     def is_whole(self) -> np.ndarray:
         """Say which last half as long as the longest or more, [S] bool: not rests of recordings."""
-        samples = np.count_nonzero(self.weight, axis=1)
-        return 2 * samples >= samples.max(initial=0)
+        steps = 1.0 + np.max(self.place * self.weight, axis=1, initial=0.0)
+        return 2 * steps >= steps.max(initial=0.0)
 
     def take(self, chosen: np.ndarray) -> "Segments":
         """Return some of the segments; noise, spread, units and past stay those of all."""
@@ -123,22 +122,37 @@ def choose_grid(recordings: Sequence[Recording], timestep: float) -> Grid:
 
     Uniform sampling: a step is a sample, in substeps no longer than the model's timestep. Otherwise
     a step is no longer than the model's timestep, commands are held on these steps, and
-    predictions are interpolated linearly between them.
+    predictions are interpolated linearly between them; a sample is as long as in the recording
+    that has most of them a second.
 
     Raises:
         UserError: Samples are too far apart to follow a motion.
     """
-    intervals = np.concatenate([np.diff(r.time[a:b]) for r in recordings for a, b in r.spans])
+    for recording in recordings:
+        if (interval := usual_interval(recording)) > SLOWEST:
+            raise UserError(
+                f"the samples of {recording.name} are {interval:.4g} s apart, too far to follow a "
+                f"motion; at most {SLOWEST:g} s are. Is time in another unit than seconds? A map "
+                "file names it"
+            )
+    intervals = np.concatenate([_intervals(r) for r in recordings])
     sample = float(np.median(intervals))
-    if sample > SLOWEST:
-        raise UserError(
-            f"the samples of the recordings are {sample:.4g} s apart, too far to follow a motion; "
-            f"at most {SLOWEST:g} s are. Is time in another unit than seconds? A map file names it"
-        )
+    is_uniform = bool(np.abs(intervals - sample).max() <= UNIFORM * sample)
+    if not is_uniform:
+        sample = min(map(usual_interval, recordings))
     substeps = max(1, int(np.ceil(sample / timestep - 1e-6)))
-    if np.abs(intervals - sample).max() <= UNIFORM * sample:
+    if is_uniform:
         return Grid(sample, substeps, 1, True)
     return Grid(sample / substeps, 1, substeps, False)
+
+
+def usual_interval(recording: Recording) -> float:
+    """Return the seconds from a sample to the next, the median."""
+    return float(np.median(_intervals(recording)))
+
+
+def _intervals(recording: Recording) -> np.ndarray:
+    return np.concatenate([np.diff(recording.time[a:b]) for a, b in recording.spans])
 
 
 def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments:
@@ -152,15 +166,15 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     Raises:
         UserError: No span is long enough for one segment.
     """
-    sample = grid.interval * grid.per_sample
-    length = max(SHORTEST, round(horizon / sample))
+    samples = [grid.interval if grid.uniform else usual_interval(r) for r in recordings]
+    lengths = [max(SHORTEST, round(horizon / sample)) for sample in samples]
     with_velocity = [r for r in recordings if r.velocity_measured]
     pieces = [
         (index, start, min(start + length, stop))
-        for index, r in enumerate(recordings)
+        for index, (r, length) in enumerate(zip(recordings, lengths, strict=True))
         for a, stop in r.spans
         for start in range(a, stop, length)
-        if min(start + length, stop) - start >= min(SHORTEST, length)
+        if min(start + length, stop) - start >= SHORTEST
     ]
     if not pieces:
         raise UserError(f"the recordings have no {SHORTEST} samples in a row; record for longer")
@@ -168,7 +182,9 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     steps = max(_steps(recordings[i].time[a:b], grid) for i, a, b in pieces)
     warm_up = warm_up_steps(grid, recordings[0].ctrl.shape[1])
     before = [_past_steps(r, grid) for r in recordings]
-    rows = [_piece(recordings[i], a, b, length, steps, warm_up, grid) for i, a, b in pieces]
+    rows = [
+        _piece(recordings[i], before[i], a, b, length, steps, warm_up, grid) for i, a, b in pieces
+    ]
     measured, weight, start, ctrl, place = (np.stack(parts) for parts in zip(*rows, strict=True))
     num_position = recordings[0].qpos.shape[1]
     num_signals = measured.shape[2] if with_velocity else num_position
@@ -251,7 +267,7 @@ def signal_noise(recording: Recording) -> np.ndarray:
     num = recording.qpos.shape[1]
     if not recording.velocity_measured or num != recording.qvel.shape[1]:
         return white
-    interval = float(np.median(np.diff(recording.time)))
+    interval = usual_interval(recording)
     longest = max(b - a for a, b in recording.spans)
     windows = np.unique(np.maximum(2, np.round(KINEMATIC_WINDOWS / interval).astype(int)))
     windows = windows[windows < longest]
@@ -315,19 +331,33 @@ def _steps(time: np.ndarray, grid: Grid) -> int:
     return int(np.ceil((time[-1] - time[0]) / grid.interval)) + 1
 
 
-def _piece(recording: Recording, a: int, b: int, length: int, steps: int, warm_up: int, grid: Grid):
-    """Return one segment's measured [L, nq + nv], weight, start, ctrl and place, padded."""
+def _piece(
+    recording: Recording,
+    at: np.ndarray,
+    a: int,
+    b: int,
+    length: int,
+    steps: int,
+    warm_up: int,
+    grid: Grid,
+):
+    """Return one segment's measured [L, nq + nv], weight, start, ctrl and place, padded.
+
+    Samples come after `at` simulated steps, [T]; so do the commands before the segment.
+    """
     padding = (0, length - (b - a))
     state = np.concatenate([recording.qpos, recording.qvel], axis=1)
     measured = np.pad(state[a:b], (padding, (0, 0)), mode="edge")
     weight = np.pad(np.ones(b - a), padding)
-    offsets = np.arange(-warm_up, steps)
+    before = np.searchsorted(at, at[a] - np.arange(warm_up, 0, -1), side="right") - 1
+    during = np.arange(steps)
     if grid.uniform:
-        held = a + offsets
+        held = a + during
         place = np.arange(length, dtype=float)
     else:
-        times = recording.time[a] + offsets * grid.interval
+        times = recording.time[a] + during * grid.interval
         held = np.searchsorted(recording.time, times + 0.5 * grid.interval, side="right") - 1
         place = np.pad((recording.time[a:b] - recording.time[a]) / grid.interval, padding)
-    ctrl = recording.ctrl[np.clip(held, 0, len(recording.time) - 1)]
+    rows = np.concatenate([before, held])
+    ctrl = recording.ctrl[np.clip(rows, 0, len(recording.time) - 1)]
     return measured, weight, state[a], ctrl, np.minimum(place, steps)

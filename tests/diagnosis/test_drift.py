@@ -1,5 +1,7 @@
 """A gain that falls while it is recorded is named as such; one that stays is not."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -11,14 +13,19 @@ from tests.diagnosis.test_fit import make_problem, record
 TIME = np.arange(0, 8, 0.004)
 
 
-def drifts(fall: float):
-    """Record a motor whose gain falls evenly from 1, by telling the model more than it gets."""
+def drifts(fall: float, part: float = 1.0):
+    """Record a motor whose gain falls evenly from 1, by telling the model more than it gets.
+
+    Only a part of each recording, from its start, is fitted.
+    """
     gain = 1.0 - fall * TIME / TIME[-1]
     recordings = []
     for seed in range(2):
         made = record(TIME, seed=seed, command=gain)
         recordings.append(made.__class__(**{**vars(made), "ctrl": made.ctrl / gain[:, None]}))
     problem = make_problem(recordings, (MotorGain(target="actuator/motor", scale=1.0),))
+    seconds = TIME[problem.segments.first]
+    problem = dataclasses.replace(problem, fitted=seconds < part * TIME[-1])
     fitted = fit(problem, problem.simulator.base, problem.segments.start, (0,))
     return fitted, find_drifts(problem, fitted, recordings)
 
@@ -34,6 +41,12 @@ def test_a_gain_that_falls_is_named_with_its_ends():
     assert drift.change.low < -0.3 < drift.change.high
     assert fitted.theta[0] == pytest.approx(0.85, abs=0.03)
     assert str(drift).startswith("scale of motor_gain at actuator/motor falls from 1")
+
+
+def test_the_ends_are_those_of_the_recording_where_only_its_beginning_is_fitted():
+    fitted, (drift,) = drifts(0.3, part=0.6)
+    assert fitted.theta[0] == pytest.approx(0.91, abs=0.02)
+    assert (drift.begin, drift.end) == pytest.approx((1.0, 0.7), abs=0.03)
 
 
 def test_a_gain_that_stays_is_not():

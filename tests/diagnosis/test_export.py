@@ -154,7 +154,8 @@ def test_a_motor_takes_a_name_that_is_free(tmp_path):
     push(tmp_path, [flexible], taken)
     plain = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
     assert plain.joint("elbow_motor_2").type[0] == mujoco.mjtJoint.mjJNT_HINGE
-    assert plain.tendon("elbow_gear_2").stiffness[0] == pytest.approx(6.0)
+    stiffness = plain.tendon_stiffness[plain.tendon("elbow_gear_2").id]
+    assert np.ravel(stiffness)[0] == pytest.approx(6.0)
 
 
 @pytest.mark.slow  # a program a kind; tests/effects has the kinds one by one

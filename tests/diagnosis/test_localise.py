@@ -99,3 +99,20 @@ def test_a_place_names_the_direction_of_a_joint_that_has_several():
     turning = missing._replace(torque=missing.torque * (np.arange(model.nv) == 4))
     assert missing.slides[:6] == (True, True, True, False, False, False)
     assert {place.signal for place in localise(turning)} == {"free.4"}
+
+
+@pytest.mark.parametrize("dropped", [0.2, 0.5])
+def test_a_model_lacks_no_torque_where_samples_are_dropped(dropped):
+    model = models.spec(models.PENDULUM).compile()
+    data = mujoco.MjData(model)
+    data.qpos[0] = 1.0
+    rows = []
+    for _ in range(2000):
+        rows.append((data.time, data.qpos[0], data.qvel[0]))
+        mujoco.mj_step(model, data)
+    time, angle, speed = np.asarray(rows)[np.random.default_rng(0).uniform(size=2000) > dropped].T
+    state, ctrl = (angle[:, None], speed[:, None]), np.zeros((len(time), 1))
+    made = Recording("made", time, *state, ctrl, {}, True, ((0, len(time)),), ())
+    missing = missing_torque(model, [made])
+    assert np.sqrt(np.mean(missing.torque**2)) < 0.02 * np.sqrt(np.mean(missing.load**2))
+    assert missing.time[-1] == pytest.approx(time[-1], abs=0.05)

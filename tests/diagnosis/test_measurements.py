@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from garat_jax.diagnosis.columns import signals, torques
+from garat_jax.diagnosis.filters import local_slope
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.diagnosis.velocity import estimate_velocity
 from garat_jax.errors import UserError
@@ -320,6 +321,14 @@ def test_velocity_estimate_takes_irregular_sampling(tmp_path):
     angle = 0.4 * np.sin(3 * time)
     estimate = estimate_velocity(MODEL, time, angle[:, None])[:, 0]
     np.testing.assert_allclose(estimate, 1.2 * np.cos(3 * time), atol=0.02)
+
+
+def test_long_signals_are_differentiated_piece_by_piece(monkeypatch):
+    time = np.cumsum(np.random.default_rng(0).uniform(0.5, 1.5, 1000)) / 250
+    values = np.sin(3 * time)[:, None]
+    at_once = local_slope(time, values)
+    monkeypatch.setattr("garat_jax.diagnosis.filters.ROWS", 300)
+    np.testing.assert_array_equal(local_slope(time, values), at_once)
 
 
 def test_quaternions_must_have_unit_norm(tmp_path):

@@ -1,0 +1,89 @@
+"""How recordings are cut: at rates of their own, with the commands that led to each segment."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from garat_jax.diagnosis.diagnose import diagnose
+from garat_jax.diagnosis.findings import Named
+from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.errors import UserError
+from tests.diagnosis.pendulum import MODEL, add_damping, record
+
+TIMESTEP = 0.002
+
+
+def sampled(time, name="made", spans=None) -> Recording:
+    time = np.asarray(time)
+    angle, ctrl = 0.4 * np.sin(3 * time), np.arange(len(time), dtype=float)
+    spans = spans or ((0, len(time)),)
+    state = angle[:, None], 1.2 * np.cos(3 * time)[:, None]
+    return Recording(name, time, *state, ctrl[:, None], {}, True, spans, ())
+
+
+def seconds_of(segments, grid) -> np.ndarray:
+    return grid.interval * (segments.place * segments.weight).max(axis=1)
+
+
+@pytest.mark.parametrize("horizon", [0.2, 1.0])
+def test_recordings_of_several_rates_are_cut_into_segments_that_last_alike(horizon):
+    made = [sampled(np.arange(8000) / 1000), sampled(np.arange(800) / 100)]
+    for recordings in (made, made[::-1]):
+        grid = choose_grid(recordings, TIMESTEP)
+        segments = cut(recordings, grid, horizon)
+        samples = horizon / np.asarray([r.time[1] for r in recordings])[segments.recording]
+        np.testing.assert_array_equal(segments.weight.sum(axis=1), samples)
+        assert np.all(np.abs(seconds_of(segments, grid) - horizon) < 0.011)
+        assert np.all(segments.is_whole)
+        assert np.bincount(segments.recording).tolist() == [round(8 / horizon)] * 2
+
+
+def test_a_rest_of_a_recording_is_not_whole():
+    segments = cut([sampled(np.arange(580) / 250)], choose_grid([sampled([0, 0.004])], 0.002), 0.5)
+    assert segments.weight.sum(axis=1).tolist() == [125.0] * 4 + [80.0]
+    assert np.all(segments.is_whole)
+    segments = cut([sampled(np.arange(560) / 250)], choose_grid([sampled([0, 0.004])], 0.002), 0.5)
+    assert segments.is_whole.tolist() == [True] * 4 + [False]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-3])
+def test_after_a_gap_the_last_command_before_it_was_held(jitter):
+    time = np.arange(200) / 100 + jitter * np.random.default_rng(0).uniform(size=200)
+    time[100:] += 60.0
+    made = sampled(time, spans=((0, 100), (100, 200)))
+    grid = choose_grid([made], 0.005)
+    assert grid.uniform == (jitter == 0.0)
+    segments = cut([made], grid, 0.2)
+    warm_up = round(0.1 / grid.interval)
+    before = segments.ctrl[segments.first == 100, :warm_up, 0]
+    assert before.tolist() == [[99.0] * warm_up]
+    begin = segments.ctrl[segments.first == 120, :warm_up, 0][0]
+    assert begin[0] in (109.0, 110.0)
+    assert begin[-1] == 119.0
+
+
+def test_a_recording_in_another_unit_of_time_is_named():
+    made = [sampled(np.arange(1000) / 100, "a.csv"), sampled(np.arange(300) * 10.0, "b.csv")]
+    with pytest.raises(UserError, match=r"samples of b\.csv are 10 s apart, too far to follow"):
+        choose_grid(made, TIMESTEP)
+
+
+def test_a_secret_is_found_in_recordings_of_several_rates():
+    made = [record(add_damping, seed) for seed in range(3)]
+    rows = slice(None, None, 4)
+    slow = dataclasses.replace(
+        made[1],
+        time=made[1].time[rows],
+        qpos=made[1].qpos[rows],
+        qvel=made[1].qvel[rows],
+        ctrl=made[1].ctrl[rows],
+        spans=((0, len(made[1].time[rows])),),
+    )
+    found = diagnose(MODEL, [made[0], slow], [made[2]])
+    first = found.selected[0]
+    damping = Named("viscous_damping", "joint/hinge")
+    assert damping in (first.named, *first.indistinguishable_from)  # as is back EMF
+    estimate = first.parameters["coefficient"]
+    assert estimate.low < 0.02 < estimate.high
