@@ -12,7 +12,6 @@ from garat_jax.dynamics import PhysicsState
 from garat_jax.env import Task
 from garat_jax.envs.rotation import roll_pitch_yaw
 
-CONTROL_SECONDS = 0.0165
 HEIGHT = 0.6
 """Initial height of the torso [m], at which the feet are just above the ground."""
 LOWEST = 0.26
@@ -43,6 +42,7 @@ class Ant(Task):
 
     mjcf: Path = Path(__file__).parent / "assets" / "ant.xml"
     num_substeps: int = 4
+    control_seconds: float = 0.0165
     episode_length: int = 1000
     solved_return: float = 2500.0  # see SOURCES.md
 
@@ -65,7 +65,7 @@ class Ant(Task):
 
     def reward(self, before: PhysicsState, action: jax.Array, after: PhysicsState) -> jax.Array:
         """Return progress and the reward for being alive, less the costs of the motors."""
-        progress = (after.qpos[0] - before.qpos[0]) / CONTROL_SECONDS
+        progress = (after.qpos[0] - before.qpos[0]) / self.control_seconds
         alive = jnp.where(after.qpos[2] > LOWEST, 1.0, -1.0)
         power = jnp.abs(action * 0.1 * after.qvel[6:]).mean()
         at_limit = (jnp.abs(_relative(after)) > 0.99).sum()

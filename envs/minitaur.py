@@ -12,7 +12,6 @@ from garat_jax.dynamics import PhysicsState
 from garat_jax.env import Task
 from garat_jax.envs.rotation import uprightness
 
-CONTROL_SECONDS = 0.01
 ENERGY_COST = 0.001
 """Metres that a joule costs: 0.005 for the energy of one of the five physics steps."""
 LOWEST = 0.13
@@ -43,6 +42,7 @@ class Minitaur(Task):
 
     mjcf: Path = Path(__file__).parent / "assets" / "minitaur.xml"
     num_substeps: int = 5
+    control_seconds: float = 0.01
     episode_length: int = 1000
     solved_return: float = 5.0  # see SOURCES.md
 
@@ -65,7 +65,7 @@ class Minitaur(Task):
         del action
         power = jnp.abs(jnp.dot(after.sensordata, after.qvel[6 + MOTORS]))
         distance = after.qpos[0] - before.qpos[0]
-        return distance - ENERGY_COST * power * CONTROL_SECONDS
+        return distance - ENERGY_COST * power * self.control_seconds
 
     def terminated(self, after: PhysicsState) -> jax.Array:
         """Say whether the robot has fallen; a state that is not finite has."""

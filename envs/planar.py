@@ -31,12 +31,12 @@ class PlanarRunner(Task):
 
     mjcf: Path
     num_substeps: int
-    control_seconds: float
     solved_return: float
     reset_noise: float
     alive_reward: float
     effort_cost: float
     fastest: float
+    control_seconds: float = 0.0
     episode_length: int = 1000
 
     def initial(self, host: mujoco.MjModel, key: jax.Array) -> tuple[jax.Array, jax.Array]:

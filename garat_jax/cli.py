@@ -193,6 +193,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return complain(f"error: {error}", FAILED)
     except UserError as error:
         return complain(f"error: {error}", USER_ERROR)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return complain(f"error: {error.filename}: {error.strerror}", USER_ERROR)
     except (AssertionError, RuntimeError) as error:
         from garat_jax.devices import describe, is_of_devices
 

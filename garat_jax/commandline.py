@@ -67,7 +67,8 @@ def how_to_go_on(arguments: Sequence[str], commands: Mapping[str, type], begun: 
     kept = [argument for argument in arguments if argument not in ("--force", "--resume")]
     command = commands.get(kept[0]) if kept else None
     options = _option_names(command) if command else []
-    if begun and "--resume" in options:
+    is_joint = "--distributed" in kept  # by several processes, of whose run none can go on alone
+    if begun and "--resume" in options and not is_joint:
         return f"go on with: {shlex.join([PROGRAM, *kept, '--resume'])}"
     if "--force" in options:
         return f"start again with: {shlex.join([PROGRAM, *kept, '--force'])}"

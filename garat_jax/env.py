@@ -13,11 +13,14 @@ import numpy as np
 
 from garat_jax import dynamics
 from garat_jax.dynamics import Dynamics, PhysicsState
+from garat_jax.errors import UserError
 from garat_jax.overrides import load_spec
 from garat_jax.types import Params
 
 LARGEST = 1e10
 """Absolute value beyond which a state has exploded; MuJoCo's own limit, mjMAXVAL."""
+SAME_DURATION = 0.01
+"""Relative difference up to which control steps last alike."""
 
 
 Transform = Callable[[jax.Array, jax.Array], jax.Array]
@@ -69,12 +72,15 @@ class Task(abc.ABC):
         num_substeps: Physics substeps in a control step.
         episode_length: Control steps after which an episode is truncated.
         solved_return: Mean return from which the task counts as solved.
+        control_seconds: How long a control step is for the reward, which counts on it; 0 if it does
+            not.
     """
 
     mjcf: Path
     num_substeps: int
     episode_length: int
     solved_return: float
+    control_seconds: float = 0.0
 
     @abc.abstractmethod
     def initial(self, host: mujoco.MjModel, key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -131,6 +137,16 @@ class Env(abc.ABC):
     ) -> StepResult:
         """Take one control step with an action [action_size], which is clipped."""
 
+    def step_sending(
+        self, params: Params, state: EnvState, action: jax.Array, sent: jax.Array, key: jax.Array
+    ) -> StepResult:
+        """Take one control step in which another action is sent than the one asked for.
+
+        The reward is for the action that was asked for, unless the environment cannot tell.
+        """
+        del action
+        return self.step(params, state, sent, key)
+
     def idle(self, params: Params, state: EnvState) -> EnvState:
         """Return a state whose next step costs as little as it can, for nobody looks at it."""
         del params
@@ -152,10 +168,14 @@ class TaskEnv(Env):
         world: The dynamics.
         transform: A fixed action transformer, (qpos and qvel as the sensors report them [nq + nv],
             command [nu]) -> command that is sent instead.
+
+    Raises:
+        UserError: A control step lasts longer or shorter than the task's reward counts on.
     """
 
     def __init__(self, task: Task, world: Dynamics, transform: Transform | None = None):
         host = world.host.model
+        _check_duration(task, task.num_substeps * world.timestep)
         self.transform = transform
         limited = host.actuator_ctrllimited.astype(bool)
         self.task = task
@@ -175,9 +195,15 @@ class TaskEnv(Env):
         self, params: Dynamics, state: EnvState, action: jax.Array, key: jax.Array
     ) -> StepResult:
         """Hold the clipped action as the command for one control step."""
+        return self.step_sending(params, state, action, action, key)
+
+    def step_sending(
+        self, params: Dynamics, state: EnvState, action: jax.Array, sent: jax.Array, key: jax.Array
+    ) -> StepResult:
+        """Hold what is sent, clipped, as the command for one control step."""
         del key
         action = self.clip(action)
-        command = self._command(params, state.physics, action)
+        command = self._command(params, state.physics, self.clip(sent))
         physics = dynamics.step(params, state.physics, command, self.task.num_substeps)
         reward = self.task.reward(state.physics, action, physics)
         terminated = self.task.terminated(physics)
@@ -202,6 +228,16 @@ class TaskEnv(Env):
     def _observe(self, params: Dynamics, physics: PhysicsState) -> jax.Array:
         """Return the observation [obs_size] of what the sensors report."""
         return self.task.observe(dynamics.sensed(params, physics))
+
+
+def _check_duration(task: Task, seconds: float) -> None:
+    wanted = task.control_seconds
+    if wanted and abs(seconds - wanted) > SAME_DURATION * wanted:
+        raise UserError(
+            f"the reward of {type(task).__name__} counts on control steps of {wanted:.4g} s, and "
+            f"{task.num_substeps} substeps of this model last {seconds:.4g} s; give the task other "
+            "num_substeps, or the model another timestep"
+        )
 
 
 def guarded_step(

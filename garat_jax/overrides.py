@@ -10,6 +10,8 @@ import numpy as np
 from garat_jax.effects.elements import OBJECT_TYPES
 from garat_jax.errors import UserError, unknown_name
 
+NUMBERS = (int, float, list, tuple, np.ndarray)
+
 
 @dataclasses.dataclass(frozen=True)
 class Override:
@@ -35,27 +37,26 @@ class Override:
             UserError: There is no such element or field.
         """
         target = self._find(spec)
-        if self.element == "body" and self.field == "mass":
-            _scale_mass(spec, target, self._number())
-            return
-        fields = [name for name in dir(target) if not name.startswith("_")]
-        known = [name for name in fields if not callable(getattr(target, name))]
+        known = [name for name in dir(target) if _is_field(target, name)]
         if self.field not in known:
             raise unknown_name(f"{self.element} field", self.field, known)
+        current = getattr(target, self.field)
         try:
-            current = getattr(target, self.field)
-            if np.ndim(current) == 1 and np.ndim(self.value) == 0:
+            if not _is_finite(self.value):
+                raise ValueError("not finite")
+            if self.element == "body" and self.field == "mass":
+                _scale_mass(spec, target, float(self.value))
+            elif np.ndim(current) == 1 and np.ndim(self.value) == 0:
                 current[0] = self.value
             else:
                 setattr(target, self.field, self.value)
+        except UserError:
+            raise
         except (TypeError, ValueError) as error:
-            raise UserError(f"{self.element}/{self.name} {self.field}: {error}") from error
-
-    def _number(self) -> float:
-        try:
-            return float(self.value)
-        except (TypeError, ValueError) as error:
-            raise UserError(f"{self.element}/{self.name} {self.field}: {error}") from error
+            where = "/".join(filter(None, (self.element, self.name)))
+            raise UserError(
+                f"{where} {self.field} = {self.value!r}; expected {_wanted(current)}"
+            ) from error
 
     def _find(self, spec: mujoco.MjSpec):
         if self.element == "option":
@@ -67,6 +68,29 @@ class Override:
             listing = {"body": "bodies"}.get(self.element, f"{self.element}s")
             raise unknown_name(self.element, self.name, [e.name for e in getattr(spec, listing)])
         return target
+
+
+def _is_field(target: Any, name: str) -> bool:
+    """Say whether a spec's attribute is something that MJCF says of an element."""
+    if name.startswith("_") or name in ("id", "signature"):
+        return False
+    value = getattr(target, name)
+    of_mujoco = type(value).__name__.startswith("mjt")
+    return of_mujoco or isinstance(value, int | float | str | np.ndarray)
+
+
+def _is_finite(value: Any) -> bool:
+    """Say whether a value is finite, as far as it is numbers."""
+    return not isinstance(value, NUMBERS) or bool(np.all(np.isfinite(value)))
+
+
+def _wanted(current: Any) -> str:
+    """Say what may stand in the place of a field's value."""
+    if isinstance(current, np.ndarray):
+        return f"{len(current)} finite numbers"
+    if isinstance(current, str):
+        return "a name"
+    return f"a finite number, as {current} is"
 
 
 def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:

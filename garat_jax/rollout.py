@@ -205,6 +205,13 @@ def without_faults(steps: Tree, faulty: jax.Array) -> Tree:
     return jax.tree.map(choose, steps)
 
 
+def thinned(recorded: Recorded, num_transitions: int) -> Recorded:
+    """Return about so many of the transitions of each seed, [seeds, T, B], evenly in time."""
+    length, num_envs = recorded.transitions.reward.shape[1:]
+    every = max(1, length * num_envs // num_transitions)
+    return jax.tree.map(lambda x: x[:, ::every], recorded)
+
+
 def evaluate(
     env: Env,
     params: Params,

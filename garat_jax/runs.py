@@ -10,6 +10,7 @@ import dataclasses
 import json
 import math
 import os
+import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -73,10 +74,11 @@ class RunDirectory:
                 "--force and --resume exclude each other: one replaces the run, one continues it"
             )
         root = Path(path)
+        line = command if isinstance(command, str) else shlex.join(command)
         record = {"config": finite_or_null(to_plain(config)), "seeds": to_plain(list(seeds))}
         if _is_occupied(root):
             if resume:
-                _check_same_run(root, record)
+                _check_same_run(root, line, record)
                 return cls(root, resumed=True)
             _check_replaceable(root)
             if not force:
@@ -90,7 +92,6 @@ class RunDirectory:
         except OSError as error:
             raise UserError(f"cannot make the folder {root}: {error.strerror}") from error
         run = cls(root)
-        line = command if isinstance(command, str) else " ".join(command)
         run.write_json(CONFIG, {"format": FORMAT, "command": line, **record, **provenance()})
         return run
 
@@ -312,10 +313,13 @@ def _is_occupied(root: Path) -> bool:
     return root.is_dir() and any(path.name != CONTENTS for path in root.iterdir())
 
 
-def _check_same_run(root: Path, record: Mapping[str, Any]) -> None:
+def _check_same_run(root: Path, command: str, record: Mapping[str, Any]) -> None:
     if not is_run(root):
         raise UserError(f"{root} holds no run to resume; give another --out")
     before = json.loads((root / CONFIG).read_text(encoding="utf-8"))
+    began, goes_on = (shlex.split(line)[:2] for line in (before["command"], command))
+    if began != goes_on:
+        raise UserError(f"{root} holds a run of {' '.join(began)}; give another --out")
     for what in ("config", "seeds"):
         _check_same(root, before[what], record[what], what)
 

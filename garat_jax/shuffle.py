@@ -1,4 +1,4 @@
-"""Random orders for minibatches."""
+"""Random orders and picks for minibatches."""
 
 import jax
 import jax.numpy as jnp
@@ -27,3 +27,14 @@ def shuffled(key: jax.Array, num: int) -> jax.Array:
     drawn = jax.random.bits(key, (num,), jnp.uint32) >> num_bits << num_bits
     words = jnp.sort(drawn | jnp.arange(num, dtype=jnp.uint32))
     return (words & ((1 << num_bits) - 1)).astype(jnp.int32)
+
+
+def picked(key: jax.Array, num: int, size: int) -> jax.Array:
+    """Return indices below `size` in random order, each as often as another but for once, [num].
+
+    Args:
+        key: PRNG key.
+        num: How many to pick; where it is less than `size`, none comes twice.
+        size: How many there are.
+    """
+    return shuffled(key, max(num, size))[:num] % size

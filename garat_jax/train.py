@@ -17,6 +17,7 @@ from garat_jax.errors import DivergedError, UserError
 from garat_jax.interrupt import deferred_interrupt
 from garat_jax.rollout import Fault
 from garat_jax.runs import RunDirectory
+from garat_jax.types import Metrics
 
 State = TypeVar("State")
 
@@ -324,15 +325,26 @@ def until_solved(step, evaluate, solved_return: float):
     """
 
     def stepped(carry: UntilSolved, params):
-        state, score, solved, key = carry
+        state, score, was_solved, key = carry
         new, metrics = step(state, params)[:2]
-        state = jax.tree.map(lambda old, n: jnp.where(solved, old, n), state, new)
+        state = jax.tree.map(lambda old, n: jnp.where(was_solved, old, n), state, new)
         key, evaluate_key = jax.random.split(key)
-        found, faulty_share = evaluate(state, params, evaluate_key, ~solved)
-        score = jnp.where(solved, score, found)
+        found, faulty_share = evaluate(state, params, evaluate_key, ~was_solved)
+        score = jnp.where(was_solved, score, found)
         solved = score >= solved_return
         faults = {f"evaluation_{FAULTY}": faulty_share}
+        metrics = _of_learners(metrics, ~was_solved)
         metrics = metrics | {"evaluation": score, "finished": solved} | faults
         return UntilSolved(state, score, solved, key), metrics
 
     return stepped
+
+
+def _of_learners(metrics: Metrics, learns: jax.Array) -> Metrics:
+    """Return metrics in which a step that was thrown away cannot stop the run."""
+
+    def kept(name: str, value: jax.Array) -> jax.Array:
+        is_harmless = jnp.isfinite(value) & (not name.endswith(FAULTY))
+        return jnp.where(learns | is_harmless, value, jnp.zeros_like(value))
+
+    return {name: kept(name, jnp.asarray(value)) for name, value in metrics.items()}

@@ -24,8 +24,13 @@ from garat_jax.effects import Effect
 from garat_jax.env import Env, Task, World, make_world
 from garat_jax.methods.garat import GARAT, GARATConfig
 from garat_jax.methods.gat import GAT, GATConfig
-from garat_jax.methods.grounded import GroundedEnv, Grounding, action_noise
-from garat_jax.methods.transition_error import best_constant, constant_error, transition_error
+from garat_jax.methods.grounded import GroundedEnv, Grounding, action_noise, check_bounded
+from garat_jax.methods.transition_error import (
+    best_constant,
+    check_differs,
+    constant_error,
+    transition_error,
+)
 from garat_jax.rollout import Recorded
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer, UntilSolved
@@ -169,8 +174,9 @@ class Experiment:
         agent = trpo.make(env, self.config.agent)
 
         def move(state: ActorCriticState, key: jax.Array, params: Params) -> ActorCriticState:
+            reset_key, key = jax.random.split(key)
             num_envs = self.config.agent.num_envs
-            return state._replace(env=rollout.reset(env, params, key, num_envs), key=key)
+            return state._replace(env=rollout.reset(env, params, reset_key, num_envs), key=key)
 
         keys = _fold(self.keys, stage)
         state = self.map(move, start, keys, params, axes=(0, 0, axes))
@@ -257,8 +263,9 @@ class Experiment:
             errors = {"error": error, "error_ratio": error / source_error}
             return state, metrics | errors | {f"error_{train.FAULTY}": faulty_share}
 
-        held_out = thinned(held_out, self.config.num_curve_transitions)
+        held_out = rollout.thinned(held_out, self.config.num_curve_transitions)
         source_error = self.source_error(held_out)
+        check_differs(np.asarray(source_error))
         params = (source.params, agent_policy, target, held_out, source_error)
         axes = (None, 0, 0, 0, 0)
         updates = self.config.num_updates
@@ -273,13 +280,6 @@ class Experiment:
             return transition_error(source.env, source.params, held_out)
 
         return self.map_guarded("the source's error", error, held_out)
-
-
-def thinned(recorded: Recorded, num_transitions: int) -> Recorded:
-    """Return about so many of the transitions of each seed, [seeds, T, B], evenly in time."""
-    length, num_envs = recorded.transitions.reward.shape[1:]
-    every = max(1, length * num_envs // num_transitions)
-    return jax.tree.map(lambda x: x[:, ::every], recorded)
 
 
 def as_of(source: World, target: World, recorded: Recorded) -> Recorded:
@@ -303,6 +303,7 @@ def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:
     """Run the experiment; write `summary.json` and return what is in it."""
     task = config.pair.task
     source, target = config.pair.worlds(config.engine)
+    check_bounded(source.env)
     run.record_settings(dataclasses.replace(config, engine=source.params.engine))
     agent = trpo.make(source.env, config.agent)
     seeds = range(config.first_seed, config.first_seed + config.seeds)
@@ -380,7 +381,7 @@ def _errors(
     """Return held-out transition errors [seeds] of source, grounded source and baselines."""
     source = experiment.worlds.source
 
-    recorded = thinned(recorded, experiment.config.num_curve_transitions)
+    recorded = rollout.thinned(recorded, experiment.config.num_curve_transitions)
 
     def errors(transformer: Params, recorded: Recorded, held_out: Recorded):
         best = best_constant(source.env, source.params, recorded)

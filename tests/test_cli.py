@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from garat_jax import cli
-from garat_jax.commandline import parse
+from garat_jax.commandline import how_to_go_on, parse
 from garat_jax.errors import DivergedError, UserError, nearest, unknown_name
 from garat_jax.runs import RunDirectory, earlier_run_kept
 from tests.test_split import free_port
@@ -86,7 +86,10 @@ def test_version():
             ["diagnose", __file__, __file__, "--condition", f"loaded={__file__}"],
             ["test_cli.py is given twice"],
         ),
-        (["demo", "--seed", "-1", "--out", "never"], ["--seed -1: expected 0 or more"]),
+        (["demo", "--seed", "-1", "--out", "never"], ["--seed -1: expected 0 to 2147483647"]),
+        (["demo", "--seed", "2147483648", "--out", "never"], ["expected 0 to 2147483647"]),
+        (["compare", 300 * "n" + ".xml", "no.csv"], ["n.xml: File name too long"]),
+        (["transfer", "x", "--out", 300 * "n"], ["unknown pair"]),
         (["demo", "--measurements", "nowhere"], ["--measurements", "no folder nowhere"]),
     ],
 )
@@ -169,6 +172,11 @@ def test_an_interrupt_of_what_cannot_resume_says_how_to_start_again(monkeypatch,
     assert cli.main(["diagnose", "my model.xml", "a.csv"]) == 130
     line = capsys.readouterr().err
     assert line.endswith("start again with: garat diagnose 'my model.xml' a.csv --force\n")
+
+
+def test_a_run_of_several_processes_cannot_go_on():
+    line = how_to_go_on(["transfer", "p", "--distributed"], cli.COMMANDS)
+    assert line == "start again with: garat transfer p --distributed --force"
 
 
 def test_arguments_reach_the_command():

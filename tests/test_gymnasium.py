@@ -245,3 +245,12 @@ def test_without_gymnasium_the_extra_is_named(monkeypatch):
         to_gymnasium(Walk(), WalkParams(0.1))
     with pytest.raises(UserError, match=r"garat_jax\[bench\]"):
         to_gymnasium_vector(Walk(), WalkParams(0.1), 2)
+
+
+def test_the_vector_takes_a_seed_for_some_of_its_environments():
+    one = to_gymnasium_vector(Walk(), WalkParams(0.1), 2)
+    other = SyncVectorEnv([lambda: to_gymnasium(Walk(), WalkParams(0.1))] * 2)
+    for seed in (3, [5, None], None, [None, 8]):
+        here, there = one.reset(seed=seed)[0], other.reset(seed=seed)[0]
+        np.testing.assert_array_equal(here, there)
+        assert one.np_random_seed == other.np_random_seed

@@ -210,6 +210,12 @@ def test_resume_of_a_folder_that_is_no_run_is_refused(tmp_path):
         create(tmp_path, resume=True)
 
 
+def test_a_run_of_another_command_is_not_resumed(tmp_path):
+    RunDirectory.create(tmp_path / "run", Config(), "garat diagnose a.xml", ())
+    with pytest.raises(UserError, match="run holds a run of garat diagnose; give another --out"):
+        RunDirectory.create(tmp_path / "run", Config(), "garat transfer x", (), resume=True)
+
+
 def test_force_and_resume_exclude_each_other(tmp_path):
     with pytest.raises(UserError, match="exclude"):
         create(tmp_path, force=True, resume=True)

@@ -323,3 +323,21 @@ def test_options_reach_the_compiler(tmp_path):
     assert loop.call(lambda x: x + 1, jnp.ones(3), options=options).sum() == 6
     with pytest.raises(jax.errors.JaxRuntimeError, match="no_such_option"):
         loop.call(lambda x: x + 1, jnp.ones(3), options={"no_such_option": True})
+
+
+def test_a_step_that_is_thrown_away_stops_nothing():
+    def step(height, params):
+        fails = {"walk_faulty_share": jnp.asarray(0.5), "kl": jnp.asarray(jnp.nan)}
+        return height + params, fails | {"reward": height}
+
+    def evaluate(height, params, key, wanted):
+        del params, key
+        return jnp.where(wanted, height, 0.0), 0.0
+
+    stepped = jax.vmap(train.until_solved(step, evaluate, 3.0), (0, None))
+    carry = climbers(0.0, 9.0)._replace(solved=jnp.asarray([False, True]))
+    carry, metrics = stepped(carry, 1.0)
+    np.testing.assert_array_equal(carry.state, [1.0, 9.0])
+    np.testing.assert_array_equal(metrics["walk_faulty_share"], [0.5, 0.0])
+    np.testing.assert_array_equal(metrics["kl"], [np.nan, 0.0])
+    np.testing.assert_array_equal(metrics["reward"], [0.0, 9.0])

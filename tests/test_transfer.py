@@ -16,10 +16,10 @@ from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.envs.pairs import PAIRS
 from garat_jax.errors import DivergedError
 from garat_jax.presets import METHODS
-from garat_jax.rollout import Recorded
+from garat_jax.rollout import Recorded, thinned
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer
-from garat_jax.transfer import Experiment, Worlds, thinned
+from garat_jax.transfer import Experiment, Worlds
 from garat_jax.types import Transition
 
 

@@ -120,6 +120,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._params = params
         self._states = self._keys = self._over = None
+        self._seeds = np.full(num_envs, None, object)
         self._same_step = same_step
         step = functools.partial(_step_and_reset if same_step else _reset_or_step, env)
         self._start = jax.jit(jax.vmap(lambda params, key: _start(env, params, key), (None, 0)))
@@ -129,6 +130,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode in each; a seed is that of the first, the others count up from it.
+
+        Of a list of seeds, those environments that have None go on with what they would draw next.
 
         Raises:
             ValueError: There is another number of seeds than of environments, or options are given.
@@ -140,12 +143,21 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             seeds = [seeds + i for i in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments")
-        if self._keys is None or any(seed is not None for seed in seeds):
-            randoms = [seeding.np_random(seed)[0] for seed in seeds]
-            self._keys = jnp.stack([_first_key(random) for random in randoms])
+        anew = [i for i, seed in enumerate(seeds) if self._keys is None or seed is not None]
+        if anew:
+            randoms, self._seeds[anew] = zip(
+                *(seeding.np_random(seeds[i]) for i in anew), strict=True
+            )
+            keys = jnp.stack([_first_key(random) for random in randoms])
+            self._keys = keys if self._keys is None else self._keys.at[np.asarray(anew)].set(keys)
         self._states, self._keys = self._start(self._params, self._keys)
         self._over = np.zeros(self.num_envs, bool)
         return np.array(self._states.obs, np.float32), {}
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return the seed of each environment, as Gymnasium's own vectors do."""
+        return tuple(self._seeds)
 
     def step(
         self, actions: np.ndarray

@@ -167,8 +167,14 @@ def episode_metrics(
 
 
 def minibatches(batch: Batch, key: jax.Array, num_minibatches: int) -> Batch:
-    """Shuffle a batch [N] and cut it into [num_minibatches, N // num_minibatches]."""
+    """Shuffle a batch [N] and cut it into [num_minibatches, N // num_minibatches].
+
+    Raises:
+        ValueError: There are more minibatches than steps.
+    """
     total = batch.action.shape[0]
     size = total // num_minibatches
+    if not size:
+        raise ValueError(f"a batch of {total} steps cannot make {num_minibatches} minibatches")
     order = shuffled(key, total)[: size * num_minibatches]
     return jax.tree.map(lambda x: x[order].reshape(num_minibatches, size, *x.shape[1:]), batch)

@@ -29,7 +29,7 @@ class PPOConfig:
     discount: Number = 0.99
     trace: Number = 0.95
     clip: Number = 0.1
-    value_weight: Number = 0.5  # stable-baselines PPO2
+    value_weight: Number = 0.5  # stable-baselines3 PPO
     entropy_weight: Number = 0.0
     max_grad_norm: Number = 0.5  # stable-baselines PPO2
 

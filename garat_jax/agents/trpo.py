@@ -128,7 +128,7 @@ def fit_value(
         return (optax.apply_updates(weights, updates), optimiser_state), value_loss
 
     def epoch(carry, key):
-        number = batch.action.shape[0] // config.value_minibatch
+        number = max(1, batch.action.shape[0] // config.value_minibatch)
         minibatches = actor_critic.minibatches(batch, key, number)
         return jax.lax.scan(minibatch_step, carry, minibatches)
 

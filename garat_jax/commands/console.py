@@ -18,6 +18,9 @@ from garat_jax.interrupt import interruptible
 if TYPE_CHECKING:
     from garat_jax.runs import RunDirectory
 
+LARGEST_SEED = 2**31 - 1
+"""Seeds are 32-bit integers in JAX; larger ones would draw what smaller ones do."""
+
 
 def complain(message: str, status: int) -> int:
     """Print one line on stderr and return the exit status that goes with it."""
@@ -57,12 +60,13 @@ def make_run(
         resume: Go on with the run that the folder holds; None if the command cannot.
 
     Raises:
-        UserError: A seed is negative, or the folder may not be written.
+        UserError: A seed is out of range, or the folder may not be written.
     """
     from garat_jax.runs import RunDirectory, earlier_run_kept
 
-    if min(seeds, default=0) < 0:
-        raise UserError(f"--seed {min(seeds)}: expected 0 or more")
+    for seed in seeds:
+        if not 0 <= seed <= LARGEST_SEED:
+            raise UserError(f"--seed {seed}: expected 0 to {LARGEST_SEED}")
     config = {
         field.name: getattr(command, field.name)
         for field in dataclasses.fields(command)
@@ -74,6 +78,8 @@ def make_run(
         _check_outside(command, out)
     with earlier_run_kept(out) if replaces else contextlib.nullcontext():
         run = RunDirectory.create(out, config, line, seeds, force=command.force, resume=resume)
+        if resume and not run.resumed:
+            complain(f"{out} holds no run to go on with; starting one", 0)
         if run.resumed and (changed := run.changed_versions()):
             complain(f"warning: the run was begun with other versions: {', '.join(changed)}", 0)
         try:

@@ -12,7 +12,12 @@ from garat_jax.diagnosis.diagnose import thin
 from garat_jax.diagnosis.differences import clear_differences, projected
 from garat_jax.diagnosis.findings import Estimate
 from garat_jax.diagnosis.fit import fit
-from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
+from garat_jax.diagnosis.horizon import (
+    choose_horizon,
+    say_horizon,
+    warn_of_divergence,
+    warn_of_sampling,
+)
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
@@ -177,7 +182,8 @@ def size(
         raise UserError("every parameter is set, so nothing is left to fit; leave one of them out")
     horizon, segments = choose_horizon(simulator, recordings, grid)
     say(say_horizon(recordings, horizon))
-    for warning in warn_of_divergence(simulator, recordings, grid, horizon):
+    warnings = warn_of_sampling(grid, host.opt.timestep)
+    for warning in (*warnings, *warn_of_divergence(simulator, recordings, grid, horizon)):
         say(f"warning: {warning}")
     problem = Problem(
         simulator,

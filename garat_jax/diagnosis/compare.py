@@ -13,7 +13,12 @@ import plotly.graph_objects as go
 from garat_jax import report
 from garat_jax.diagnosis import figures
 from garat_jax.diagnosis.diagnose import thin
-from garat_jax.diagnosis.horizon import choose_horizon, say_horizon, warn_of_divergence
+from garat_jax.diagnosis.horizon import (
+    choose_horizon,
+    say_horizon,
+    warn_of_divergence,
+    warn_of_sampling,
+)
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording, checked
@@ -170,7 +175,8 @@ def compare(
     say("choosing the horizon")
     stated, segments = choose_horizon(simulator, recordings, grid)
     say(say_horizon(recordings, stated))
-    warnings = warn_of_divergence(simulator, recordings, grid, stated)
+    warnings = warn_of_sampling(grid, host.opt.timestep)
+    warnings += warn_of_divergence(simulator, recordings, grid, stated)
     warnings += (STILL,) if is_still(segments) else ()
     played = {}
     for horizon in sorted({stated, *lasting_horizons(recordings)}):

@@ -19,6 +19,7 @@ from garat_jax.diagnosis.horizon import (
     choose_horizon,
     say_horizon,
     warn_of_divergence,
+    warn_of_sampling,
 )
 from garat_jax.diagnosis.judge import NIL, SMALLEST_SHARE, is_enough
 from garat_jax.diagnosis.leftover import leftover
@@ -75,6 +76,7 @@ def diagnose(
     say(say_horizon(everything, horizon))
     simulator = Simulator(model, (*shared, *others), grid, acting=range(len(shared)))
     warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
+    warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, everything, grid, horizon)
     sample = grid.interval * grid.per_sample
     suggested = suggest(simulator.effects, host, fitted)

@@ -23,6 +23,8 @@ LARGEST_ERROR = 0.2
 """Error within a segment, relative to the signal's spread, for the same reason."""
 BEYOND = 4.0
 """Standard deviations of its noise that the error of a signal may reach by noise alone."""
+MUCH_SHORTER = 0.4
+"""Part of the model's timestep up to which one that samples ask for is told."""
 MOST = 0.9
 """Share of the segments that must keep below both."""
 GONE = 100.0
@@ -109,6 +111,16 @@ def warn_of_divergence(
         )
     cut_to = f"; segments were shortened to {horizon:g} s" if horizon < longest else ""
     return (f"{when}, in {diverges.sum()} of {len(diverges)} segments{cut_to}",)
+
+
+def warn_of_sampling(grid: Grid, timestep: float) -> tuple[str, ...]:
+    """Say that a sample is much shorter than the model's timestep [s], so that another is taken."""
+    if grid.timestep > MUCH_SHORTER * timestep:
+        return ()
+    return (
+        f"the model's timestep of {timestep:g} s is longer than a sample; it is simulated at "
+        f"{grid.timestep:.3g} s, and errs otherwise at its own",
+    )
 
 
 def say_horizon(recordings: Sequence[Recording], horizon: float) -> str:

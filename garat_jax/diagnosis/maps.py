@@ -143,6 +143,8 @@ def _column(name: str, table: Any) -> Column:
             raise UserError(f"[column] {name} {key} = {value!r}; expected a finite number")
     if numbers.get("sign", 1) not in (1, -1):
         raise UserError(f"[column] {name} sign = {numbers['sign']}; expected 1 or -1")
+    if numbers.get("scale", 1) == 0:
+        raise UserError(f"[column] {name} scale = 0; expected another number")
     unit = str(table["unit"]) if "unit" in table else None
     if unit is not None:
         unit_of(name, unit)

@@ -135,6 +135,8 @@ def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
         effects = tuple(_effect(table, catalogue) for table in _tables(card, "effect"))
         host = compile(spec, overrides, engine="mujoco").host.model
         for effect in effects:
+            if sum((e.kind, e.target) == (effect.kind, effect.target) for e in effects) > 1:
+                raise UserError(f"{effect.kind} is at {effect.target} twice; write it once")
             effect.check(host)
             check_bounds(effect, host)
     except UserError as error:

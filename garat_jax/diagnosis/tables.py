@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy import io
 
+from garat_jax.env import LARGEST
 from garat_jax.errors import UserError, unknown_name
 
 FEWEST_SAMPLES = 20
@@ -115,6 +116,12 @@ def check_samples(table: Table) -> None:
             raise UserError(
                 f"{table.path}: {name} is NaN, infinite or empty at {table.rows(bad)}; "
                 "expected a finite number: leave such samples out, a gap is split there"
+            )
+        huge = np.abs(column) > LARGEST
+        if huge.any() and name != "time":
+            raise UserError(
+                f"{table.path}: {name} is {column[huge][0]:g} at {table.rows(huge)}; nothing was "
+                f"measured that is beyond {LARGEST:g}: leave such samples out"
             )
     late = np.concatenate([[False], np.diff(time) <= 0])
     if late.any():

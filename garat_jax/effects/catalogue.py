@@ -69,13 +69,13 @@ def run_python(path: Path, option: str) -> ModuleType:
     sys.modules[name] = module  # dataclasses look their module up there
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
         raise UserError(f"{path}{line_in(path, error)}: {type(error).__name__}: {error}") from error
     return module
 
 
-def line_in(path: str | Path, error: Exception) -> str:
+def line_in(path: str | Path, error: BaseException) -> str:
     """Return the last line of a file that an error came through, as ` line N`."""
     if isinstance(error, SyntaxError):
         return f" line {error.lineno}"
@@ -116,3 +116,9 @@ def _check(cls: type[Effect], origin: str) -> None:
         )
     if not cls.parameters():
         raise UserError(f"{origin}: {cls.__name__} has no parameter; declare one by parameter(...)")
+    for p in cls.parameters():
+        if not p.low < p.high:
+            raise UserError(
+                f"{origin}: {p.name} of {cls.__name__} goes from {p.low:g} to {p.high:g}; expected "
+                "low below high"
+            )

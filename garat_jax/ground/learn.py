@@ -33,7 +33,7 @@ from garat_jax.methods.recorded import (
     needed_change,
     path_error,
 )
-from garat_jax.methods.transition_error import transition_error
+from garat_jax.methods.transition_error import check_differs, constant_error, transition_error
 from garat_jax.runs import RunDirectory
 from garat_jax.train import FAULTY, Trainer
 from garat_jax.transfer import GroundConfig, make_method
@@ -285,13 +285,13 @@ def _errors(env: RecordedEnv, world: Dynamics, recorded, trainer: Trainer, optio
     """Return the transition errors of the source, and of the source with every action zero."""
 
     def both(world, recorded):
-        idle = recorded.transitions._replace(action=jnp.zeros_like(recorded.transitions.action))
         return {
             "source": transition_error(env, world, recorded),
-            "zero_action": transition_error(env, world, recorded._replace(transitions=idle)),
+            "zero_action": constant_error(env, world, recorded, 0.0),
         }
 
     found = trainer.call(both, world, recorded, options=options)
     for name, error in found.items():
         trainer.check_faults(f"{name} error", np.asarray(error.faulty_share)[None])
+    check_differs(np.asarray(found["source"].mean))
     return {name: float(error.mean) for name, error in found.items()}

@@ -24,7 +24,7 @@ from garat_jax.methods.grounded import (
     decode_action,
 )
 from garat_jax.networks import Discriminator, forward
-from garat_jax.shuffle import shuffled
+from garat_jax.shuffle import picked, shuffled
 from garat_jax.types import Metrics, Params, Policy, Transition
 
 
@@ -171,8 +171,7 @@ class GARAT:
         num = self.config.num_minibatches
         size = grounded.shape[0] // num
         order = shuffled(grounded_key, grounded.shape[0])[: num * size]
-        # Each equally often, in one pass if the sizes are alike.
-        picks = shuffled(target_key, num * size) % wanted.shape[0]
+        picks = picked(target_key, num * size, wanted.shape[0])
         batches = [data.reshape(num, size, -1) for data in (grounded[order], wanted[picks])]
         keys = jax.random.split(penalty_key, num)
 

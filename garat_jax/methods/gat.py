@@ -16,7 +16,7 @@ from garat_jax import rollout
 from garat_jax.env import Env
 from garat_jax.methods.grounded import GroundedEnv
 from garat_jax.networks import MLP, forward
-from garat_jax.shuffle import shuffled
+from garat_jax.shuffle import picked
 from garat_jax.types import Metrics, Params, Policy, Transition
 
 
@@ -146,11 +146,14 @@ class GAT:
         """Learn both models for some epochs; arguments as `init`'s."""
         del env_params, agent
         key, epochs_key = jax.random.split(state.key)
+        # An epoch is a pass over the larger of both data sets.
+        larger = max(target.reward.shape[0], state.source.reward.shape[0])
+        num = max(1, larger // self.config.minibatch)
 
         def epoch(carry, key):
             target_key, source_key = jax.random.split(key)
-            target_batches = self._minibatches(target, target_key)
-            source_batches = self._minibatches(state.source, source_key)
+            target_batches = self._minibatches(target, num, target_key)
+            source_batches = self._minibatches(state.source, num, source_key)
             return jax.lax.scan(self._learn, carry, (target_batches, source_batches))
 
         carry: Any = (state.transformer.policy, state.optimiser)
@@ -162,13 +165,10 @@ class GAT:
         told = jnp.zeros_like(state.faulty_share)
         return GATState(transformer, state.source, told, optimiser, key), metrics
 
-    def _minibatches(self, data: Transition, key: jax.Array) -> Transition:
-        """Return one pass over the larger of both data sets, [num, minibatch] of this one."""
-        config = self.config
-        total = config.num_envs * config.num_steps
-        num = max(1, total // config.minibatch)
-        picks = shuffled(key, num * config.minibatch) % data.reward.shape[0]
-        picks = picks.reshape(num, config.minibatch)
+    def _minibatches(self, data: Transition, num: int, key: jax.Array) -> Transition:
+        """Return random transitions of a data set, [num, minibatch], each about equally often."""
+        size = self.config.minibatch
+        picks = picked(key, num * size, data.reward.shape[0]).reshape(num, size)
         return jax.tree.map(lambda x: x[picks], data)
 
     def _learn(self, carry, batches: tuple[Transition, Transition]):

@@ -29,6 +29,8 @@ class Grounding(NamedTuple):
 class GroundedEnv(Env):
     """An environment whose actions pass through a transformer; the reward is the task's.
 
+    As on the machine, it is for what the agent asks for, not for what the transformer makes of it.
+
     Args:
         env: The environment.
         transform: `(transformer_params, obs, action, key) -> action`.
@@ -56,10 +58,15 @@ class GroundedEnv(Env):
     def step(
         self, params: Grounding, state: EnvState, action: jax.Array, key: jax.Array
     ) -> StepResult:
-        """Step the environment with the transformed action."""
+        """Step the environment with the transformed action; the agent is paid for its own."""
         transform_key, key = jax.random.split(key)
-        action = self.transform(params.transformer, state.obs, self.env.clip(action), transform_key)
-        return self.env.step(params.env, state, action, key)
+        action = self.env.clip(action)
+        sent = self.transform(params.transformer, state.obs, action, transform_key)
+        return self.env.step_sending(params.env, state, action, sent, key)
+
+    def idle(self, params: Grounding, state: EnvState) -> EnvState:
+        """Return a state in which the environment idles."""
+        return self.env.idle(params.env, state)
 
     def must_be_finite(self, state: EnvState) -> Any:
         """Return what must be finite in the environment."""
@@ -138,6 +145,16 @@ class TransformerEnv(Env):
         return state.obs, self.env.must_be_finite(state)
 
 
+def check_bounded(env: Env) -> None:
+    """Refuse an environment whose actions are not bounded: transformers count in their ranges.
+
+    Raises:
+        UserError: Some action is not.
+    """
+    if not np.isfinite(env.action_low).all() or not np.isfinite(env.action_high).all():
+        raise UserError("an action transformer needs bounded actions: give actuators a ctrlrange")
+
+
 def decode_action(
     env: Env, output_is: Output, reach: float
 ) -> Callable[[jax.Array, jax.Array], jax.Array]:
@@ -154,8 +171,7 @@ def decode_action(
     Raises:
         UserError: The environment's actions are not bounded.
     """
-    if not np.isfinite(env.action_low).all() or not np.isfinite(env.action_high).all():
-        raise UserError("an action transformer needs bounded actions: give actuators a ctrlrange")
+    check_bounded(env)
     half_range = (env.action_high - env.action_low) / 2
     middle = (env.action_high + env.action_low) / 2
 
@@ -167,7 +183,12 @@ def decode_action(
 
 
 def action_noise(env: Env) -> Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]:
-    """Return what adds noise to actions; its parameter is the noise's scale in half-ranges, []."""
+    """Return what adds noise to actions; its parameter is the noise's scale in half-ranges, [].
+
+    Raises:
+        UserError: The environment's actions are not bounded.
+    """
+    check_bounded(env)
     half_range = (env.action_high - env.action_low) / 2
 
     def transform(scale: jax.Array, obs: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:

@@ -4,9 +4,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from garat_jax import rollout
 from garat_jax.env import Env
+from garat_jax.errors import UserError
 from garat_jax.rollout import Recorded
 from garat_jax.types import Params
 
@@ -34,6 +36,19 @@ def transition_error(env: Env, params: Params, recorded: Recorded) -> Transition
     sound = ~(faulty | recorded.transitions.faulty.reshape(-1))
     distance = jnp.linalg.norm(next_obs - wanted, axis=-1)
     return TransitionError(jnp.sum(distance * sound) / sound.sum(), faulty.mean())
+
+
+def check_differs(source_error: np.ndarray) -> None:
+    """Refuse a source whose transition error, [...], is nil: there is nothing to ground.
+
+    Raises:
+        UserError: It is, of some seed.
+    """
+    if np.any(source_error == 0.0):
+        raise UserError(
+            "from the recorded states the source does just what the target did, so there is "
+            "nothing to ground"
+        )
 
 
 def constant_error(

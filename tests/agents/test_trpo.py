@@ -10,9 +10,9 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from garat_jax.agents import trpo
-from garat_jax.agents.actor_critic import Batch
+from garat_jax.agents.actor_critic import Batch, minibatches
 from garat_jax.agents.trpo import TRPOConfig
-from garat_jax.networks import GaussianPolicy, forward
+from garat_jax.networks import GaussianPolicy, ValueNet, forward
 
 NETWORK = GaussianPolicy(size=2, hidden=(5,), initial_log_std=-0.5)
 CONFIG = TRPOConfig(fisher_share=1.0)
@@ -164,3 +164,14 @@ def test_a_limit_on_the_mean_of_the_components_allows_their_number_of_times_as_m
     undamped = (dataclasses.replace(config, cg_damping=0.0) for config in (summed, averaged))
     one, two = (float(policy_step(weights, batch, config=c)[1]["kl"]) for c in undamped)
     assert two == pytest.approx(NETWORK.size * one, rel=0.05)
+
+
+def test_a_batch_smaller_than_a_minibatch_is_one():
+    _, batch = weights_and_batch(num=20)
+    value_net = ValueNet((5,))
+    value = value_net.init(jax.random.key(0), batch.obs)
+    optimiser = trpo.value_optimiser(CONFIG).init(value)
+    fitted = trpo.fit_value(value_net, value, optimiser, batch, jax.random.key(1), CONFIG)
+    assert np.isfinite(fitted[2])
+    with pytest.raises(ValueError, match="a batch of 20 steps cannot make 21 minibatches"):
+        minibatches(batch, jax.random.key(0), 21)

@@ -130,6 +130,17 @@ def test_samples_too_far_apart_to_follow_are_refused():
         choose_grid(recordings, 0.002)
 
 
+def test_a_timestep_much_longer_than_a_sample_is_told():
+    recordings = record_weak(0.0)
+    slow = MODEL.spec.copy()
+    slow.option.timestep = 0.02
+    model = dataclasses.replace(MODEL, spec=slow, catalogue={})
+    found = diagnose(model, recordings)
+    assert found.warnings[0].startswith(
+        "the model's timestep of 0.02 s is longer than a sample; it is simulated at 0.004 s"
+    )
+
+
 def test_what_is_odd_about_recordings_is_a_warning_of_their_diagnosis():
     model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
     recordings = record_weak(0.0)

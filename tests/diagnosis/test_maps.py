@@ -100,6 +100,7 @@ def test_units_are_what_they_say():
         ('"deg"', '"mm"', "qpos.hinge cannot be in 'mm'; expected one of rad, mrad, deg, turn"),
         ('"ms"', '"deg"', "time cannot be in 'deg'; expected one of s, ms"),
         ("sign = -1, offset", "sign = -2, offset", "qpos.hinge sign = -2; expected 1 or -1"),
+        ("sign = -1, offset", "scale = 0, offset", "qpos.hinge scale = 0; expected another number"),
         ("offset = 90", 'offset = "90"', "qpos.hinge offset = '90'; expected a finite number"),
         ("offset", "ofset", "unknown key of [column] qpos.hinge 'ofset'; did you mean offset"),
         ('from = "angle", ', "", 'qpos.hinge lacks from = "NAME"'),

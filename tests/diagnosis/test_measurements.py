@@ -140,6 +140,13 @@ def test_nan_and_infinity_name_their_lines(tmp_path):
     assert "at rows 3, 7;" in message
 
 
+def test_what_nothing_measures_names_its_line(tmp_path):
+    table = columns()
+    table["qvel.hinge"][7] = -1e300
+    message = refusal(save(tmp_path, table))
+    assert "qvel.hinge is -1e+300 at line 9; nothing was measured that is beyond 1e+10" in message
+
+
 def test_many_bad_rows_are_counted(tmp_path):
     message = refusal(save(tmp_path, columns(ctrl__motor=np.full(200, np.nan))))
     assert "lines 2, 3, 4, 5, 6 and 195 more" in message

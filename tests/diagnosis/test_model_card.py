@@ -25,6 +25,7 @@ kind = "coulomb_friction"
 target = "joint/elbow"
 parameters = { torque = 0.25 }
 """
+FRICTION = CARD[CARD.index("[[effect]]") :]
 
 
 def write(folder, text=CARD):
@@ -138,6 +139,8 @@ def test_card_elsewhere_is_refused(tmp_path):
         ("0.25", '"0.25"', "coulomb_friction torque = '0.25'; expected a finite number"),
         ("0.25", "nan", "coulomb_friction torque = nan; expected a finite number"),
         ("parameters = { torque = 0.25 }", "", "[[effect]] lacks parameters"),
+        ("value = 1.3", "value = nan", "body/forearm mass = nan; expected a finite number"),
+        ("[[effect]]", FRICTION + "[[effect]]", "is at joint/elbow twice; write it once"),
     ],
 )
 def test_refusals(tmp_path, old, new, said):

@@ -103,6 +103,8 @@ def test_a_mistake_in_a_law_is_one_line_that_says_where(mine, wrong, said):
         ('("joint",)', '"joint"', "expected a tuple of body, joint"),
         ("@struct.dataclass\n", "", "needs the decorator flax.struct.dataclass"),
         ("class Spring(Effect)", "class Spring", "holds no effect"),
+        ("import jax\n", "import sys; sys.exit(7)\n", "line 3: SystemExit: 7"),
+        ("high=10.0", "high=-10.0", "stiffness of Spring goes from 0 to -10; expected low below"),
     ],
 )
 def test_a_bad_file_is_one_line(mine, capsys, old, new, said):

@@ -36,7 +36,7 @@ def state_at(world, **changed):
 def test_numbers_are_the_models(world):
     host = world.params.host.model
     np.testing.assert_allclose(ant.RANGES, host.jnt_range[1:], atol=1e-12)
-    assert world.params.timestep * Ant.num_substeps == pytest.approx(ant.CONTROL_SECONDS)
+    assert world.params.timestep * Ant.num_substeps == pytest.approx(Ant.control_seconds)
     assert (world.env.obs_size, world.env.action_size) == (28, 8)
     joints = [host.joint(i).name for i in range(1, host.njnt)]
     assert joints == [host.actuator(i).name for i in range(host.nu)]

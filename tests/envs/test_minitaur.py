@@ -1,5 +1,7 @@
 """Minitaur: the robot stands, its legs stay closed, its motors are the published ones."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -7,10 +9,12 @@ import numpy as np
 import pytest
 
 from garat_jax import dynamics
+from garat_jax.dynamics import Override
 from garat_jax.env import make_world
 from garat_jax.envs import minitaur, minitaur_motors
 from garat_jax.envs.minitaur import Minitaur
 from garat_jax.envs.pairs import PAIRS
+from garat_jax.errors import UserError
 
 LEGS = ("front_left", "back_left", "front_right", "back_right")
 SUPPLY, RESISTANCE, TORQUE_CONSTANT, TORQUE_LIMIT, KD = 16.0, 0.186, 0.0954, 5.7, 0.02
@@ -113,7 +117,7 @@ def test_numbers_are_the_models(world):
     motors = [model.actuator(i).name for i in range(model.nu)]
     assert [model.joint(1 + i).name for i in minitaur.MOTORS] == motors
     assert motors == [f"{leg}_{link}" for leg in LEGS for link in ("ahead", "behind")]
-    assert world.params.timestep * Minitaur.num_substeps == pytest.approx(minitaur.CONTROL_SECONDS)
+    assert world.params.timestep * Minitaur.num_substeps == pytest.approx(Minitaur.control_seconds)
     assert (world.env.obs_size, world.env.action_size) == (28, 8)
     np.testing.assert_allclose(model.qpos0[7 + minitaur.MOTORS], minitaur.SPLAY)
 
@@ -169,3 +173,15 @@ def test_the_measured_curve_is_below_the_line_beyond_its_first_point():
     current = minitaur_motors.CURRENTS[2:]
     line = minitaur_motors.TORQUE_CONSTANT * current
     assert (np.asarray(minitaur_motors.torque_of(jnp.asarray(current))) < line).all()
+
+
+def test_a_model_whose_control_steps_last_otherwise_is_refused():
+    slower = Override("option", "", "timestep", 0.004)
+    with pytest.raises(UserError, match=r"Minitaur counts on control steps of 0\.01 s, and 5 sub"):
+        make_world(Minitaur(), (slower,), engine="mujoco")
+    world = make_world(
+        dataclasses.replace(Minitaur(), num_substeps=10),
+        (Override("option", "", "timestep", 0.001),),
+        engine="mujoco",
+    )
+    assert world.env.obs_size == 28

@@ -6,16 +6,21 @@ import numpy as np
 import pytest
 
 from garat_jax import rollout
+from garat_jax.env import TaskEnv, make_world
+from garat_jax.envs.half_cheetah import HalfCheetah
+from garat_jax.errors import UserError
 from garat_jax.methods.grounded import (
     GroundedEnv,
     Grounding,
     TransformerEnv,
     TransformerParams,
+    action_noise,
     decode_action,
 )
 from garat_jax.methods.transition_error import (
     CONSTANT_ACTIONS,
     best_constant,
+    check_differs,
     constant_error,
     transition_error,
 )
@@ -114,8 +119,9 @@ def test_decoding(output_is, reach, action, output, sent):
 
 
 def test_unbounded_actions_are_refused():
-    with pytest.raises(ValueError, match="bounded actions: give actuators a ctrlrange"):
-        decode_action(transformer_env(), "change", 1.0)
+    for make in (lambda env: decode_action(env, "change", 1.0), action_noise):
+        with pytest.raises(UserError, match="bounded actions: give actuators a ctrlrange"):
+            make(transformer_env())
 
 
 def test_transition_error_is_the_mean_distance():
@@ -155,3 +161,31 @@ def test_the_error_is_that_of_the_sound_steps_and_says_how_many_were_not():
     assert 0 < failed.mean() < 1
     assert error.faulty_share == pytest.approx(failed.mean())
     assert error.mean == pytest.approx(GAIN / 2, rel=1e-5)
+
+
+def test_the_agent_is_paid_for_what_it_asks_for_as_on_the_machine():
+    world = make_world(HalfCheetah(), engine="mujoco")
+    grounded = GroundedEnv(world.env, lambda scale, obs, action, key: scale * action)
+    fixed = TaskEnv(HalfCheetah(), world.params, lambda state, command: 0.5 * command)
+    state, action = world.env.reset(world.params, jax.random.key(0)), 1.5 * jnp.ones(6)
+    params = Grounding(world.params, jnp.asarray(0.5))
+    result = grounded.step(params, state, action, jax.random.key(1))
+    same = fixed.step(world.params, state, action, jax.random.key(1))
+    sent = world.env.step(world.params, state, 0.5 * jnp.ones(6), jax.random.key(1))
+    np.testing.assert_array_equal(result.state.obs, sent.state.obs)
+    np.testing.assert_array_equal(result.state.obs, same.state.obs)
+    assert result.reward == same.reward
+    assert sent.reward - result.reward == pytest.approx(0.1 * 6 * (1.0 - 0.25), rel=1e-4)
+
+
+def test_a_grounded_environment_idles_as_its_own_does():
+    world = make_world(HalfCheetah(), engine="mujoco")
+    grounded = GroundedEnv(world.env, lambda params, obs, action, key: action)
+    state = world.env.reset(world.params, jax.random.key(0))
+    assert jnp.isnan(grounded.idle(Grounding(world.params, ()), state).physics.time)
+
+
+def test_a_source_that_is_the_target_is_refused():
+    check_differs(np.asarray([1e-9, 2.0]))
+    with pytest.raises(UserError, match="there is nothing to ground"):
+        check_differs(np.asarray([0.1, 0.0]))
