@@ -37,4 +37,7 @@ def picked(key: jax.Array, num: int, size: int) -> jax.Array:
         num: How many to pick; where it is less than `size`, none comes twice.
         size: How many there are.
     """
-    return shuffled(key, max(num, size))[:num] % size
+    order = shuffled(key, max(num, size))[:num]
+    if num <= size:
+        return order
+    return shuffled(jax.random.fold_in(key, 1), size)[order % size]  # who comes once more is random

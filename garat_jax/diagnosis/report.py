@@ -98,7 +98,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
     )
     them = "it" if len(diagnosis.selected) == 1 else "them"
     if diagnosis.verdict == "missing_effect":
-        return f"The model lacks {names}. With {them}, {fall}."
+        return f"The model lacks {names}. With {them}, {fall}{diagnosis.but}."
     if names:
         rest = f"With {them}, {fall}: {diagnosis.rest}."
         return f"The model lacks {names}, but that is not all. {rest}"
@@ -121,7 +121,7 @@ def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     """Return the numbers of a diagnosis to be seen first."""
     error, over = diagnosis.decisive, diagnosis.over
     rest = Fact(_percent(error.unexplained_share), "of the error stays unexplained")
-    if num := len(diagnosis.loud):
+    if num := len(error.above_floor if diagnosis.but else diagnosis.loud):
         rest = Fact(str(num), f"{'signal stays' if num == 1 else 'signals stay'} above the noise")
     return [
         Fact(_percent(error.before), f"error of the model as it is{over}, of each signal's spread"),

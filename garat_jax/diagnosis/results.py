@@ -228,7 +228,7 @@ class Diagnosis:
             )
         names = " and ".join(c.with_alike() for c in self.selected)
         if self.verdict == "missing_effect":
-            return f"Missing: {names}; {fall}."
+            return f"Missing: {names}; {fall}{self.but}."
         if names:
             return f"Found {names}; {fall}; but {self.rest}."
         if rivals := self.rivals():
@@ -265,6 +265,22 @@ class Diagnosis:
             return f"that of {', '.join(self.loud)}{self.over} stays well above its noise floor"
         share = 100 * self.decisive.unexplained_share
         return f"{share:.0f} % of the error{self.over} stays unexplained"
+
+    @property
+    def but(self) -> str:
+        """A clause with the signals that stay well above their noise floor; empty if none does.
+
+        Where an effect explains the error of all signals together, of a signal with little noise
+        something may be left that this noise does not hide.
+        """
+        if self.verdict != "missing_effect" or not self.error.above_floor:
+            return ""
+        each = []
+        for name in self.error.above_floor:
+            of_signal = self.error.per_signal[name]
+            times = float(of_signal["after"]) / float(of_signal["noise_floor"])
+            each.append(f"that of {name} stays at {times:.2g}")
+        return f", but {', '.join(each)} times its own noise floor"
 
     @property
     def loud(self) -> tuple[str, ...]:

@@ -151,6 +151,19 @@ def test_a_gap_in_single_signals_is_not_said_to_be_0_percent_of_the_error():
     assert diagnosis_facts(diagnosis)[-1].value == "1"
 
 
+def test_a_signal_that_stays_loud_beside_what_was_found_is_named():
+    of_angle = {"before": 0.1, "after": 0.019, "noise_floor": 0.001, "unit": "rad"}
+    error = dataclasses.replace(
+        MISSING.error, per_signal={"qpos.hinge": of_angle}, above_floor=("qpos.hinge",)
+    )
+    diagnosis = dataclasses.replace(MISSING, error=error)
+    left = ", but that of qpos.hinge stays at 19 times its own noise floor."
+    assert diagnosis.sentence.endswith(left)
+    assert diagnosis_lead(diagnosis).endswith(left)
+    fact = diagnosis_facts(diagnosis)[-1]
+    assert (fact.value, fact.label) == ("1", "signal stays above the noise")
+
+
 def test_rivals_of_which_none_leads_are_named():
     rival = dataclasses.replace(OFFSET, why=NO_CERTAIN_LEAD)
     other = dataclasses.replace(rival, effect="motor_gain", target="actuator/motor")

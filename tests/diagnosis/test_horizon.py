@@ -134,7 +134,8 @@ def test_a_timestep_much_longer_than_a_sample_is_told():
     recordings = record_weak(0.0)
     slow = MODEL.spec.copy()
     slow.option.timestep = 0.02
-    model = dataclasses.replace(MODEL, spec=slow, catalogue={})
+    catalogue = {"motor_gain": CATALOGUE["motor_gain"]}
+    model = dataclasses.replace(MODEL, spec=slow, catalogue=catalogue)
     found = diagnose(model, recordings)
     assert found.warnings[0].startswith(
         "the model's timestep of 0.02 s is longer than a sample; it is simulated at 0.004 s"
