@@ -89,8 +89,7 @@ def compile(
 
     Raises:
         UserError: An override or effect does not fit the model, a parameter is outside its bounds,
-            the timestep is not above 0, or the engine cannot step the model or would ignore a part
-            of it.
+            or the engine cannot step the model or would ignore a part of it.
     """
     if engine not in ENGINES:
         raise unknown_name("engine", engine, ENGINES)
@@ -109,8 +108,6 @@ def compile(
         host = HostModel(spec.compile())
     except ValueError as error:
         raise UserError(f"MuJoCo cannot compile the model: {error}") from error
-    if host.model.opt.timestep <= 0:
-        raise UserError(f"timestep is {host.model.opt.timestep:g} s; expected more than 0")
     model = put_model(host.model) if engine == "mjx" else None
     as_arrays = jax.tree.map(jnp.asarray, tuple(effects))
     return Dynamics(effects=as_arrays, model=model, host=host, engine=engine)

@@ -47,9 +47,14 @@ class HostModel:
         model: The model. Its automatic reset on bad states is off: a simulation that diverges
             stays diverged in both engines, and the caller sees it. One of a single tree is not
             searched for islands, of which it has one.
+
+    Raises:
+        UserError: Its timestep is not above 0.
     """
 
     def __init__(self, model: mujoco.MjModel):
+        if not model.opt.timestep > 0:
+            raise UserError(f"timestep is {model.opt.timestep:g} s; expected more than 0")
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         if model.ntree <= 1:
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND

@@ -347,51 +347,6 @@ def test_quaternions_must_have_unit_norm(tmp_path):
     assert "qpos.free.3 to qpos.free.6 are no unit quaternion (w x y z) at line 7" in message
 
 
-def test_quaternions_of_either_sign_are_read_alike(tmp_path):
-    time, qpos, _ = tumbling()
-    names = [s.name for s in signals(TUMBLER)][: TUMBLER.nq]
-    flipped = qpos.copy()
-    flipped[60:, 3:7] *= -1
-    flipped[30:100, 7:11] *= -1
-    plain, other = (
-        Recording.read(
-            save(tmp_path, {"time": time, **dict(zip(names, q.T, strict=True))}), TUMBLER
-        )
-        for q in (qpos, flipped)
-    )
-    np.testing.assert_array_equal(other.qpos, plain.qpos)
-    np.testing.assert_array_equal(other.qvel, plain.qvel)
-
-
-def turning(wrapped: bool):
-    """A pendulum that turns round twice, back once and stays there, 4 s at 250 Hz."""
-    time = np.arange(1000) / 250
-    angle = np.interp(time, [0.0, 2.0, 3.0, 4.0], [0.0, 4 * np.pi, 2 * np.pi, 2 * np.pi + 0.1])
-    written = (angle + np.pi) % (2 * np.pi) - np.pi if wrapped else angle
-    return columns(1000, time=time, qpos__hinge=written, qvel__hinge=np.gradient(angle, time))
-
-
-def test_an_angle_that_is_written_within_a_turn_goes_on_turning(tmp_path):
-    spec = models.spec(models.PENDULUM)
-    spec.joints[0].limited = mujoco.mjtLimited.mjLIMITED_FALSE
-    model = spec.compile()
-    recording = Recording.read(save(tmp_path, turning(wrapped=True)), model)
-    plain = Recording.read(save(tmp_path, turning(wrapped=False)), model)
-    np.testing.assert_allclose(recording.qpos, plain.qpos, atol=1e-9)
-    assert (
-        recording.warnings[0] == "run.csv: qpos.hinge jumps by a turn and is taken to go on turning"
-    )
-    assert not [line for line in plain.warnings if "turning" in line]
-
-
-def test_a_joint_that_cannot_turn_is_not_unwrapped(tmp_path):
-    spec = models.spec(models.PENDULUM)
-    spec.joints[0].limited = mujoco.mjtLimited.mjLIMITED_TRUE
-    spec.joints[0].range = [-3.0, 3.0]
-    recording = Recording.read(save(tmp_path, turning(wrapped=True)), spec.compile())
-    assert np.ptp(recording.qpos) < 2 * np.pi + 1e-9
-
-
 @pytest.mark.parametrize("rate", [50.0, 1000.0])
 def test_noise_is_recovered_on_motion(tmp_path, rate):
     rng = np.random.default_rng(0)

@@ -1,0 +1,53 @@
+"""Changes of a model before it is compiled: what they reach, and each refusal."""
+
+import numpy as np
+import pytest
+
+from garat_jax import dynamics
+from garat_jax.dynamics import Override
+from garat_jax.errors import UserError
+from tests.models import PENDULUM, spec
+
+
+def compiled(override: Override):
+    return dynamics.compile(spec(PENDULUM), (override,), engine="mujoco").host.model
+
+
+def test_a_mass_override_scales_the_inertia_with_it():
+    before = spec(PENDULUM).compile()
+    after = compiled(Override("body", "pole", "mass", 1.8))
+    np.testing.assert_allclose(after.body("pole").mass, 1.8)
+    np.testing.assert_allclose(after.body("pole").inertia, 3 * before.body("pole").inertia)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (Override("body", "pool", "mass", 1.0), "did you mean pole"),
+        (Override("joint", "hinge", "dampling", 1.0), "did you mean damping"),
+        (Override("body", "pole", "mass", -1.0), "must be positive"),
+        (
+            Override("body", "pole", "mass", "heavy"),
+            "pole mass = 'heavy'; expected a finite",
+        ),
+        (Override("body", "pole", "mass", float("nan")), "body/pole mass = nan; expected a finite"),
+        (
+            Override("body", "pole", "inertia", [1.0, 2.0]),
+            "expected 3 finite numbers",
+        ),
+        (
+            Override("option", "", "integrator", "foo"),
+            "integrator = 'foo'; expected a finite",
+        ),
+        (Override("joint", "hinge", "range", [0.0, float("inf")]), "expected 2 finite numbers"),
+        (Override("joint", "hinge", "parent", 1.0), "unknown joint field 'parent'"),
+        (Override("option", "", "timestep", 0.0), "timestep is 0 s; expected more than 0"),
+        (Override("option", "", "timestep", -0.1), "timestep is -0.1 s; expected more than 0"),
+        (Override("body", "pole", "add_body", 1.0), "unknown body field 'add_body'"),
+        (Override("bodi", "pole", "mass", 1.0), "did you mean body"),
+    ],
+)
+def test_a_wrong_override_is_refused_in_one_line(override, message):
+    with pytest.raises(UserError, match=message) as error:
+        compiled(override)
+    assert "\n" not in str(error.value)
