@@ -36,7 +36,7 @@ class PlanarRunner(Task):
     alive_reward: float
     effort_cost: float
     fastest: float
-    control_seconds: float = 0.0
+    control_seconds: float = dataclasses.field(kw_only=True)
     episode_length: int = 1000
 
     def initial(self, host: mujoco.MjModel, key: jax.Array) -> tuple[jax.Array, jax.Array]:

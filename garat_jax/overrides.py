@@ -10,7 +10,7 @@ import numpy as np
 from garat_jax.effects.elements import OBJECT_TYPES
 from garat_jax.errors import UserError, unknown_name
 
-NUMBERS = (int, float, list, tuple, np.ndarray)
+NUMBERS = (int, float, np.number, list, tuple, np.ndarray)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,10 +87,12 @@ def _is_finite(value: Any) -> bool:
 def _wanted(current: Any) -> str:
     """Say what may stand in the place of a field's value."""
     if isinstance(current, np.ndarray):
-        return f"{len(current)} finite numbers"
+        return f"a finite number or {len(current)} of them"
     if isinstance(current, str):
         return "a name"
-    return f"a finite number, as {current} is"
+    if isinstance(current, float):
+        return f"a finite number, as {current:g} is"
+    return f"a whole number, as {int(current)} is"
 
 
 def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:

@@ -317,7 +317,7 @@ def _check_same_run(root: Path, command: str, record: Mapping[str, Any]) -> None
     if not is_run(root):
         raise UserError(f"{root} holds no run to resume; give another --out")
     before = json.loads((root / CONFIG).read_text(encoding="utf-8"))
-    began, goes_on = (shlex.split(line)[:2] for line in (before["command"], command))
+    began, goes_on = (line.split()[:2] for line in (before["command"], command))
     if began != goes_on:
         raise UserError(f"{root} holds a run of {' '.join(began)}; give another --out")
     for what in ("config", "seeds"):

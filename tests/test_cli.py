@@ -89,7 +89,7 @@ def test_version():
         (["demo", "--seed", "-1", "--out", "never"], ["--seed -1: expected 0 to 2147483647"]),
         (["demo", "--seed", "2147483648", "--out", "never"], ["expected 0 to 2147483647"]),
         (["compare", 300 * "n" + ".xml", "no.csv"], ["n.xml: File name too long"]),
-        (["transfer", "x", "--out", 300 * "n"], ["unknown pair"]),
+        (["transfer", "hopper_heavy", "--out", 300 * "n"], ["nn: File name too long"]),
         (["demo", "--measurements", "nowhere"], ["--measurements", "no folder nowhere"]),
     ],
 )

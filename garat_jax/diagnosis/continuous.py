@@ -12,8 +12,8 @@ import numpy as np
 from garat_jax.effects.elements import quaternions
 
 TURN = 2 * np.pi
-WRITTEN_OVER = 1.001
-"""Turns that a wrapped angle is written over, at most; an encoder's last step may be a bit more."""
+WRITTEN_OVER = 1.05
+"""Turns that a wrapped angle is written over, at most: one, and noise."""
 JUMP = 0.75
 """Turns that it jumps between two samples, at least."""
 
@@ -56,5 +56,5 @@ def unwrapped(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int]) ->
     """Return positions [T, nq] in which the angles of some hinges count turns."""
     qpos = qpos.copy()
     places = model.jnt_qposadr[list(joints)]
-    qpos[:, places] = np.unwrap(qpos[:, places], axis=0)
+    qpos[:, places] = np.unwrap(qpos[:, places], discont=JUMP * TURN, axis=0)
     return qpos

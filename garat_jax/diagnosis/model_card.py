@@ -78,7 +78,7 @@ class Model:
 
         Raises:
             UserError: The task's own model has other joints or actuators, its control steps another
-                length than the transformer's, or as `compile`.
+                length than the transformer's or than its reward counts on, or as `compile`.
         """
         params = self.compile(engine)
         own = compile(load_spec(task.mjcf), engine="mujoco").host.model

@@ -178,12 +178,12 @@ class Problem(Generic[AnySimulator]):
         return self.residual_by(self.simulator.refined(2), theta, start) - residual
 
     def blocks(self) -> np.ndarray:
-        """Return each whitened residual's block within its segment, [N]."""
+        """Return each whitened residual's block of time within its segment, [S, N]."""
         num_samples, num_signals = self.segments.measured.shape[1:]
-        size = max(1, round(BLOCK / self.interval))
-        count = max(1, num_samples // size)
-        block = np.minimum(np.arange(num_samples) * count // num_samples, count - 1)
-        return np.repeat(block, num_signals)
+        count = max(1, num_samples // max(1, round(BLOCK / self.interval)))
+        place = self.segments.place
+        block = np.floor(place * count / (np.floor(place.max()) + 1.0)).astype(int)
+        return np.repeat(np.minimum(block, count - 1), num_signals, axis=1)
 
 
 AnyProblem = TypeVar("AnyProblem", bound=Problem)

@@ -11,7 +11,10 @@ import numpy as np
 
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.replay import Replay
+from garat_jax.diagnosis.segments import usual_interval
 
+ALIKE = 1.1
+"""Ratio up to which sampling intervals are taken for the same."""
 LAGS = 25
 """Lags looked at, in samples."""
 QUANTILE = 2.576
@@ -85,11 +88,17 @@ class Residuals:
 def examine(played: Replay, recordings: Sequence[Recording], inputs: Sequence[str]) -> Residuals:
     """Test a model's residuals for whiteness and for independence of the commands.
 
+    Lags are samples: of recordings at several rates, those at the highest are tested.
+
     Args:
         played: Predictions of the recordings.
         recordings: What was measured.
         inputs: Names of the commands.
     """
+    intervals = np.asarray([usual_interval(r) for r in recordings])
+    interval = float(intervals.min())
+    is_tested = (intervals <= ALIKE * interval)[played.segments.recording]
+    counts = played.segments.counts * is_tested[:, None, None]
     weight = played.segments.weight
     rows = [
         np.minimum(first + np.arange(weight.shape[1]), len(recordings[r].time) - 1)
@@ -98,11 +107,10 @@ def examine(played: Replay, recordings: Sequence[Recording], inputs: Sequence[st
     commands = np.stack(
         [recordings[r].ctrl[k] for r, k in zip(played.segments.recording, rows, strict=True)]
     )
-    interval = float(np.median(np.diff(recordings[0].time)))
     lags = min(LAGS, weight.shape[1] - 2)
     whiteness, independence = [], []
     for i, name in enumerate(played.names):
-        weight = played.segments.counts[..., i]
+        weight = counts[..., i]
         residual = _centred(played.deviation[..., i], weight)
         own = _correlation(residual, residual, lags)
         num = float(weight.sum())

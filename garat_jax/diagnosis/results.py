@@ -279,8 +279,9 @@ class Diagnosis:
         for name in self.error.above_floor:
             of_signal = self.error.per_signal[name]
             times = float(of_signal["after"]) / float(of_signal["noise_floor"])
-            each.append(f"that of {name} stays at {times:.2g}")
-        return f", but {', '.join(each)} times its own noise floor"
+            each.append(f"{name} at {times:.2g} times")
+        floors = "its own noise floor" if len(each) == 1 else "their own noise floors"
+        return f", but that of {' and '.join(each)} {floors}"
 
     @property
     def loud(self) -> tuple[str, ...]:

@@ -58,6 +58,8 @@ class Segments:
         noise: Standard deviation of each signal's noise, [num_signals].
         spread: Standard deviation of each signal, `QUIET` times its noise at least, [num_signals].
         start_unit: What the initial states differ by, a unit of each component, [nq + nv].
+        lasts: Simulated steps that a segment lasts, if it is not of a recording that has too few
+            samples in them, or is shorter.
     """
 
     measured: np.ndarray
@@ -75,12 +77,13 @@ class Segments:
     noise: np.ndarray
     spread: np.ndarray
     start_unit: np.ndarray
+    lasts: float = np.inf
 
     @property
     def is_whole(self) -> np.ndarray:
         """Say which last half as long as the longest or more, [S] bool: not rests of recordings."""
         steps = 1.0 + np.max(self.place * self.weight, axis=1, initial=0.0)
-        return 2 * steps >= steps.max(initial=0.0)
+        return 2 * steps >= min(self.lasts, steps.max(initial=0.0))
 
     def take(self, chosen: np.ndarray) -> "Segments":
         """Return some of the segments; noise, spread, units and past stay those of all."""
@@ -217,6 +220,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         noise=deviations,
         spread=np.maximum(spread, QUIET * deviations),
         start_unit=_unit(start),
+        lasts=horizon / grid.interval,
     )
 
 

@@ -157,7 +157,7 @@ def test_a_signal_that_stays_loud_beside_what_was_found_is_named():
         MISSING.error, per_signal={"qpos.hinge": of_angle}, above_floor=("qpos.hinge",)
     )
     diagnosis = dataclasses.replace(MISSING, error=error)
-    left = ", but that of qpos.hinge stays at 19 times its own noise floor."
+    left = ", but that of qpos.hinge at 19 times its own noise floor."
     assert diagnosis.sentence.endswith(left)
     assert diagnosis_lead(diagnosis).endswith(left)
     fact = diagnosis_facts(diagnosis)[-1]

@@ -1,5 +1,7 @@
 """`garat export`: plain MJCF with the same physics, and words for what MJCF cannot say."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -141,9 +143,8 @@ def test_an_exported_payload_may_have_another(tmp_path):
         model = load_model(export_mjcf(card, tmp_path / f"{number}.xml").path)
     plain = mujoco.MjModel.from_xml_path(str(model.path))
     assert plain.body("forearm_payload").mass[0] == plain.body("forearm_payload_2").mass[0] == 0.2
-    twice = load_model(save_card(tmp_path / "twice.toml", model, [payload, payload]))
     with pytest.raises(UserError, match="a payload_mass at body/forearm already"):
-        twice.compile()
+        dataclasses.replace(model, effects=(payload, payload)).compile()
 
 
 def test_a_motor_takes_a_name_that_is_free(tmp_path):

@@ -98,7 +98,7 @@ def test_nothing_passes_where_a_moment_is_held_out(problem):
     held_out = np.flatnonzero(~problem.fitted)
     kept = np.union1d(np.flatnonzero(problem.fitted), held_out[:1])
     first, _ = judged(problem.take(kept), 0.7, 0.8)
-    num_blocks = len(np.unique(problem.blocks()))
+    num_blocks = len(np.unique(problem.blocks()[0]))
     assert num_blocks < FEWEST_SEGMENTS
     assert first.why == TOO_FEW
 

@@ -8,7 +8,9 @@ import pytest
 from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.findings import Named
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.errors import UserError
 from tests.diagnosis.pendulum import MODEL, add_damping, record
 
@@ -87,3 +89,21 @@ def test_a_secret_is_found_in_recordings_of_several_rates():
     assert damping in (first.named, *first.indistinguishable_from)  # as is back EMF
     estimate = first.parameters["coefficient"]
     assert estimate.low < 0.02 < estimate.high
+
+
+def test_blocks_of_time_last_alike_at_any_rate():
+    made = [sampled(np.arange(4000) / 1000), sampled(np.arange(400) / 100)]
+    grid = choose_grid(made, TIMESTEP)
+    segments = cut(made, grid, 2.0)
+    problem = Problem(Simulator(MODEL, (), grid), segments, segments.recording < 1, 0.001)
+    blocks = problem.blocks()[:, ::2]
+    for s, count in ((0, 2000), (2, 200)):
+        assert np.bincount(blocks[s, :count]).tolist() == [count // 8] * 8
+    assert np.all(blocks[2, 200:] == 0)
+
+
+def test_segments_of_a_slow_recording_do_not_make_rests_of_the_others():
+    made = [sampled(np.arange(4000) / 1000), sampled(np.arange(80) / 20)]
+    segments = cut(made, choose_grid(made, TIMESTEP), 0.2)
+    assert np.all(segments.is_whole)
+    assert segments.weight.sum(axis=1)[-1] == 10.0
