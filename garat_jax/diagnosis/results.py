@@ -275,13 +275,15 @@ class Diagnosis:
         """
         if self.verdict != "missing_effect" or not self.error.above_floor:
             return ""
-        each = []
-        for name in self.error.above_floor:
-            of_signal = self.error.per_signal[name]
-            times = float(of_signal["after"]) / float(of_signal["noise_floor"])
-            each.append(f"{name} at {times:.2g} times")
-        floors = "its own noise floor" if len(each) == 1 else "their own noise floors"
-        return f", but that of {' and '.join(each)} {floors}"
+        names, times = self.error.above_floor, []
+        for of_signal in map(self.error.per_signal.__getitem__, names):
+            times.append(f"{float(of_signal['after']) / float(of_signal['noise_floor']):.2g}")
+        if len(names) == 1:
+            return f", but that of {names[0]} stays at {times[0]} times its own noise floor"
+        listed = " and ".join(
+            f"{name} (at {t} times)" for name, t in zip(names, times, strict=True)
+        )
+        return f", but those of {listed} stay above their own noise floors"
 
     @property
     def loud(self) -> tuple[str, ...]:

@@ -21,7 +21,6 @@ from garat_jax.effects.at_joint import actuator_torque, at_dof, feedback, is_dri
 from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
 from garat_jax.effects.elements import element_id
 from garat_jax.effects.motor_body import add_gear, add_motor
-from garat_jax.errors import UserError
 
 RIGID = 1e9
 """Stiffness [N m/rad] that stands for "does not bend"."""
@@ -194,19 +193,12 @@ class Transmission(Effect, abc.ABC):
         """Make the motor a body of its own, beside the link, and the gear a tendon between them.
 
         The joint keeps its place, its friction, its limits and its sensors.
-
-        Raises:
-            UserError: A name that the motor or the gear gets is taken.
         """
         if not bool(self.active):
             return ""
-        try:
-            host = spec.copy().compile()
-            motor = add_motor(spec, host, self.name, self.inertia(host))
-            gear = add_gear(spec, self.name, motor)
-        except ValueError as error:
-            why = " ".join(str(error).split())
-            raise UserError(f"{self.kind} at {self.target} cannot be exported: {why}") from error
+        host = spec.copy().compile()
+        motor = add_motor(spec, host, self.name, self.inertia(host))
+        gear = add_gear(spec, self.name, motor)
         how = self.tie(gear, spec.option.timestep)
         said = (
             f"{self.kind} at {self.target} as a force; instead {motor} is a body with the motor's "

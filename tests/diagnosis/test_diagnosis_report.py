@@ -157,11 +157,17 @@ def test_a_signal_that_stays_loud_beside_what_was_found_is_named():
         MISSING.error, per_signal={"qpos.hinge": of_angle}, above_floor=("qpos.hinge",)
     )
     diagnosis = dataclasses.replace(MISSING, error=error)
-    left = ", but that of qpos.hinge at 19 times its own noise floor."
+    left = ", but that of qpos.hinge stays at 19 times its own noise floor."
     assert diagnosis.sentence.endswith(left)
     assert diagnosis_lead(diagnosis).endswith(left)
     fact = diagnosis_facts(diagnosis)[-1]
     assert (fact.value, fact.label) == ("1", "signal stays above the noise")
+    both = {"qpos.hinge": of_angle, "qvel.hinge": of_angle | {"after": 0.003}}
+    error = dataclasses.replace(error, per_signal=both, above_floor=tuple(both))
+    assert dataclasses.replace(MISSING, error=error).sentence.endswith(
+        ", but those of qpos.hinge (at 19 times) and qvel.hinge (at 3 times) stay above their own "
+        "noise floors."
+    )
 
 
 def test_rivals_of_which_none_leads_are_named():

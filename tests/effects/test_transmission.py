@@ -156,15 +156,6 @@ def test_an_export_needs_a_fine_timestep_where_the_gear_is_stiff():
         assert (farthest < 0.05) == is_stable
 
 
-def test_a_name_that_is_taken_is_refused_in_one_line():
-    taken = spec(RIG.replace('"pole"', '"hinge_motor"'))
-    with pytest.raises(
-        UserError, match=r"cannot be exported: .*repeated name 'hinge_motor'"
-    ) as why:
-        EXPORTED["has play"].export(taken)
-    assert "\n" not in str(why.value)
-
-
 def test_a_rigid_motor_is_not_exported():
     for rigid in (JointFlexibility("joint/hinge"), Backlash("joint/hinge")):
         exported = spec(RIG)
