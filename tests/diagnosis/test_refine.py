@@ -39,6 +39,7 @@ def found_with(friction: float, torque):
     return diagnose(model, [record(rub, seed, torque=torque) for seed in range(4)])
 
 
+@pytest.mark.slow  # nine minutes
 def test_a_peak_at_rest_is_stribeck_friction():
     (found,) = found_with(STATIC, weakening).selected
     assert found.effect == "stribeck_friction"
