@@ -158,7 +158,7 @@ def thin(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
 
 
 def _excess(recording: Recording) -> int:
-    return max(1, int(1.0 / (ENOUGH * float(np.median(np.diff(recording.time)))) + 1e-6))
+    return max(1, int(1.0 / (ENOUGH * recording.interval) + 1e-6))
 
 
 def _every(r: Recording, step: int) -> Recording:

@@ -168,8 +168,8 @@ def _features(m: MissingTorque, dof: int):
 
 def _of_span(model: mujoco.MjModel, recording: "Recording", span: slice):
     """Return the columns of `MissingTorque` for one span of one recording, at even steps."""
-    time = even_steps(recording.time[span])
     sampled = recording.time[span]
+    time = even_steps(sampled)
     qpos = interpolated(time, sampled, recording.qpos[span])
     velocity = interpolated(time, sampled, recording.qvel[span])
     ctrl = held(time, sampled, recording.ctrl[span])

@@ -59,6 +59,11 @@ class Recording:
     spans: tuple[tuple[int, int], ...]
     warnings: tuple[str, ...]
 
+    @property
+    def interval(self) -> float:
+        """Seconds from a sample to the next, the median."""
+        return float(np.median(np.concatenate([np.diff(self.time[a:b]) for a, b in self.spans])))
+
     def __repr__(self) -> str:
         seconds = self.time[-1] - self.time[0]
         return f"Recording({self.name!r}, {len(self.time)} samples in {seconds:.3g} s)"

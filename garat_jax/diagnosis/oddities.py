@@ -44,8 +44,9 @@ def oddities(recording: "Recording", model: mujoco.MjModel) -> list[str]:
     clock = _clock(recording, ratios, model)
     lines = []
     if clock != "s":
-        interval = _interval(recording)
-        lines.append(f"the samples are {interval:.4g} s apart; is time in {clock}? {_mend(clock)}")
+        lines.append(
+            f"the samples are {recording.interval:.4g} s apart; is time in {clock}? {_mend(clock)}"
+        )
     in_time = {dof: ratio * UNITS[clock].factor for dof, ratio in ratios.items()}
     by_velocity = _contradictions(in_time, model)
     lines += by_velocity.values()
@@ -56,10 +57,6 @@ def oddities(recording: "Recording", model: mujoco.MjModel) -> list[str]:
 
 def _mend(unit: str) -> str:
     return f'give it in {UNITS[unit].si}, or unit = "{unit}" in a map file (--map)'
-
-
-def _interval(recording: "Recording") -> float:
-    return float(np.median(np.diff(recording.time)))
 
 
 def _velocity_ratios(recording: "Recording", model: mujoco.MjModel) -> dict[int, float]:
@@ -88,9 +85,9 @@ def _clock(recording: "Recording", ratios: dict[int, float], model: mujoco.MjMod
     for unit in CLOCKS:
         if told and all(_is_near(ratio, 1 / UNITS[unit].factor) for ratio in told):
             hinges = [signals(model)[model.nq + dof].unit == "rad/s" for dof in ratios]
-            if any(hinges) or _interval(recording) > SLOWEST:  # a slide may be in mm/s instead
+            if any(hinges) or recording.interval > SLOWEST:  # a slide may be in mm/s instead
                 return unit
-    fitting = [u for u in ("s", *CLOCKS) if _interval(recording) * UNITS[u].factor <= SLOWEST]
+    fitting = [u for u in ("s", *CLOCKS) if recording.interval * UNITS[u].factor <= SLOWEST]
     return fitting[0] if fitting else CLOCKS[-1]
 
 

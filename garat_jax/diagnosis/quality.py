@@ -134,7 +134,7 @@ def torque_per_command(model: mujoco.MjModel) -> np.ndarray:
 def _lag(parts: list[tuple[Recording, MissingTorque]], index: int, dof: int, gain: float) -> float:
     """Return the lag of one actuator that explains the torque at one dof best."""
     remainders = np.zeros(len(LAGS))
-    interval = float(np.median(np.diff(parts[0][0].time)))
+    interval = parts[0][0].interval
     lags = LAGS + 0.5 * interval
     for part, m in parts:
         (a, b) = part.spans[0]

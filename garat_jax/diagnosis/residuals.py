@@ -11,7 +11,6 @@ import numpy as np
 
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.replay import Replay
-from garat_jax.diagnosis.segments import usual_interval
 
 ALIKE = 1.1
 """Ratio up to which sampling intervals are taken for the same."""
@@ -95,7 +94,7 @@ def examine(played: Replay, recordings: Sequence[Recording], inputs: Sequence[st
         recordings: What was measured.
         inputs: Names of the commands.
     """
-    intervals = np.asarray([usual_interval(r) for r in recordings])
+    intervals = np.asarray([r.interval for r in recordings])
     interval = float(intervals.min())
     is_tested = (intervals <= ALIKE * interval)[played.segments.recording]
     counts = played.segments.counts * is_tested[:, None, None]

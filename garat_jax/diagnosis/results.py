@@ -275,14 +275,14 @@ class Diagnosis:
         """
         if self.verdict != "missing_effect" or not self.error.above_floor:
             return ""
-        names, times = self.error.above_floor, []
-        for of_signal in map(self.error.per_signal.__getitem__, names):
-            times.append(f"{float(of_signal['after']) / float(of_signal['noise_floor']):.2g}")
-        if len(names) == 1:
-            return f", but that of {names[0]} stays at {times[0]} times its own noise floor"
-        listed = " and ".join(
-            f"{name} (at {t} times)" for name, t in zip(names, times, strict=True)
-        )
+        times = {}
+        for name in self.error.above_floor:
+            of_signal = self.error.per_signal[name]
+            times[name] = float(of_signal["after"]) / float(of_signal["noise_floor"])
+        if len(times) == 1:
+            ((name, size),) = times.items()
+            return f", but that of {name} stays at {size:.2g} times its own noise floor"
+        listed = " and ".join(f"{name} (at {size:.2g} times)" for name, size in times.items())
         return f", but those of {listed} stay above their own noise floors"
 
     @property

@@ -132,30 +132,21 @@ def choose_grid(recordings: Sequence[Recording], timestep: float) -> Grid:
         UserError: Samples are too far apart to follow a motion.
     """
     for recording in recordings:
-        if (interval := usual_interval(recording)) > SLOWEST:
+        if recording.interval > SLOWEST:
             raise UserError(
-                f"the samples of {recording.name} are {interval:.4g} s apart, too far to follow a "
-                f"motion; at most {SLOWEST:g} s are. Is time in another unit than seconds? A map "
-                "file names it"
+                f"the samples of {recording.name} are {recording.interval:.4g} s apart, too far to "
+                f"follow a motion; at most {SLOWEST:g} s are. Is time in another unit than "
+                "seconds? A map file names it"
             )
-    intervals = np.concatenate([_intervals(r) for r in recordings])
+    intervals = np.concatenate([np.diff(r.time[a:b]) for r in recordings for a, b in r.spans])
     sample = float(np.median(intervals))
     is_uniform = bool(np.abs(intervals - sample).max() <= UNIFORM * sample)
     if not is_uniform:
-        sample = min(map(usual_interval, recordings))
+        sample = min(r.interval for r in recordings)
     substeps = max(1, int(np.ceil(sample / timestep - 1e-6)))
     if is_uniform:
         return Grid(sample, substeps, 1, True)
     return Grid(sample / substeps, 1, substeps, False)
-
-
-def usual_interval(recording: Recording) -> float:
-    """Return the seconds from a sample to the next, the median."""
-    return float(np.median(_intervals(recording)))
-
-
-def _intervals(recording: Recording) -> np.ndarray:
-    return np.concatenate([np.diff(recording.time[a:b]) for a, b in recording.spans])
 
 
 def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments:
@@ -169,7 +160,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     Raises:
         UserError: No span is long enough for one segment.
     """
-    samples = [grid.interval if grid.uniform else usual_interval(r) for r in recordings]
+    samples = [grid.interval if grid.uniform else r.interval for r in recordings]
     lengths = [max(SHORTEST, round(horizon / sample)) for sample in samples]
     with_velocity = [r for r in recordings if r.velocity_measured]
     pieces = [
@@ -271,7 +262,7 @@ def signal_noise(recording: Recording) -> np.ndarray:
     num = recording.qpos.shape[1]
     if not recording.velocity_measured or num != recording.qvel.shape[1]:
         return white
-    interval = usual_interval(recording)
+    interval = recording.interval
     longest = max(b - a for a, b in recording.spans)
     windows = np.unique(np.maximum(2, np.round(KINEMATIC_WINDOWS / interval).astype(int)))
     windows = windows[windows < longest]

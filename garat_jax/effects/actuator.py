@@ -179,7 +179,7 @@ class TorqueSaturation(Effect):
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Switch the limit of the force on, where the model has none at infinity."""
         actuator = spec.actuator(self.name)
-        if not _has_forcerange(actuator):
+        if not is_limited(actuator.forcelimited, actuator.forcerange):
             actuator.forcerange = np.array([-UNLIMITED, UNLIMITED])
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
 
@@ -196,16 +196,21 @@ class TorqueSaturation(Effect):
         """Narrow the range of the actuator's force."""
         actuator = spec.actuator(self.name)
         limit = float(self.limit) / abs(gear_in(spec, actuator))
-        low, high = actuator.forcerange if _has_forcerange(actuator) else (-limit, limit)
+        low, high = (
+            actuator.forcerange
+            if is_limited(actuator.forcelimited, actuator.forcerange)
+            else (-limit, limit)
+        )
         actuator.forcerange = np.array([max(low, -limit), min(high, limit)])
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
         return ""
 
 
-def _has_forcerange(actuator: mujoco.MjsActuator) -> bool:
-    if actuator.forcelimited == mujoco.mjtLimited.mjLIMITED_AUTO:
-        return bool(actuator.forcerange[0] < actuator.forcerange[1])
-    return actuator.forcelimited == mujoco.mjtLimited.mjLIMITED_TRUE
+def is_limited(limited: mujoco.mjtLimited, bounds: np.ndarray) -> bool:
+    """Say whether MuJoCo's compiler takes a spec's bounds [2] for limits."""
+    if limited == mujoco.mjtLimited.mjLIMITED_AUTO:
+        return bool(bounds[0] < bounds[1])
+    return limited == mujoco.mjtLimited.mjLIMITED_TRUE
 
 
 @struct.dataclass
@@ -261,7 +266,9 @@ class BackEmf(Effect):
 
 def can_bias(actuator: mujoco.MjsActuator) -> bool:
     """Say whether an actuator's bias can add to its force unchecked."""
-    return actuator.biastype in BIASES and not _has_forcerange(actuator)
+    return actuator.biastype in BIASES and not is_limited(
+        actuator.forcelimited, actuator.forcerange
+    )
 
 
 def make_affine(actuator: mujoco.MjsActuator) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from scipy import optimize, signal
 
-from garat_jax.effects.actuator import can_bias, make_affine
+from garat_jax.effects.actuator import can_bias, is_limited, make_affine
 from garat_jax.effects.at_joint import at_dof
 from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
 from garat_jax.effects.elements import element_id
@@ -95,9 +95,7 @@ class TorqueOffset(Effect):
     def export(self, spec: mujoco.MjSpec) -> str:
         """Add to the bias of an unlimited actuator at an unlimited joint, if there is one."""
         joint = spec.joint(self.name)
-        is_clamped = joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_TRUE or (
-            joint.actfrclimited == mujoco.mjtLimited.mjLIMITED_AUTO and np.any(joint.actfrcrange)
-        )
+        is_clamped = is_limited(joint.actfrclimited, joint.actfrcrange)
         for actuator in spec.actuators:
             at_joint = (
                 actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == self.name

@@ -7,7 +7,6 @@ import numpy as np
 
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.segments import usual_interval
 from garat_jax.errors import UserError
 from garat_jax.methods.recorded import Paths, Steps
 
@@ -48,7 +47,7 @@ def choose_bounds(
             f"{model.path} has no actuator, and an action transformer changes commands; "
             "garat diagnose finds what is missing in passive motion"
         )
-    sample = max(usual_interval(r) for r in recordings)
+    sample = max(r.interval for r in recordings)
     if interval is None:
         interval = sample * max(1, round(INTERVAL / sample))
     if interval < (1 - 1e-3) * sample:
