@@ -183,7 +183,7 @@ def true_error(
         Simulator(true, (), grid),
         segments,
         segments.recording < len(fitted),
-        grid.interval * grid.per_sample,
+        grid.sample,
     )
     settled = settle(problem, problem.simulator.base, segments.start)
     return make_metric(problem).error(settled.residual, ~problem.fitted)

@@ -189,7 +189,7 @@ def size(
         simulator,
         segments,
         np.ones(len(segments.start), bool),
-        grid.interval * grid.per_sample,
+        grid.sample,
         suggest((effect,), host, recordings),
     )
     metric = make_metric(dataclasses.replace(problem, fitted=~problem.fitted))

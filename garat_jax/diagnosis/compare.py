@@ -260,7 +260,7 @@ def _at_horizons(played: Mapping[float, Replay]) -> tuple[AtHorizon, ...]:
 def _errors(played: Replay, simulator: Simulator, grid: Grid) -> Errors:
     segments = played.segments
     nothing = np.zeros(len(segments.start), bool)
-    problem = Problem(simulator, segments, nothing, grid.interval * grid.per_sample)
+    problem = Problem(simulator, segments, nothing, grid.sample)
     metric = make_metric(problem)
     floor = noise_floor(problem, metric, settle(problem, simulator.base, segments.start))
     by_noise = dict(zip(played.sizes(), floor.rms.tolist(), strict=True))

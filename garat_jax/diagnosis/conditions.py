@@ -205,7 +205,7 @@ def _fit_together(
     joint = JointSimulator(Simulator(model, unmoved, grid), selected, condition)
     _, segments = choose_horizon(joint, everything, grid)
     fitted = np.ones(len(segments.start), bool)
-    problem = Problem(joint, segments, fitted, grid.interval * grid.per_sample)
+    problem = Problem(joint, segments, fitted, grid.sample)
     start = segments.start
     if longer := cut_longer(problem, everything, grid, joint.base):
         problem, start = longer[0], longer[1].start

@@ -78,10 +78,9 @@ def diagnose(
     warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
     warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, everything, grid, horizon)
-    sample = grid.interval * grid.per_sample
     suggested = suggest(simulator.effects, host, fitted)
     seen = segments.recording < len(fitted)
-    problem = Problem(simulator, segments, seen, sample, suggested)
+    problem = Problem(simulator, segments, seen, grid.sample, suggested)
     say("the model as it is")
     settled = settle(problem, simulator.base, segments.start)
     problem = trusted(problem, settled)

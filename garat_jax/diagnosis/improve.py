@@ -163,7 +163,7 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     simulator = Simulator(model, effects, grid)
     _, segments = choose_horizon(simulator, everything, grid)
     seen = segments.recording < len(fitted)
-    problem = Problem(simulator, segments, seen, grid.interval * grid.per_sample)
+    problem = Problem(simulator, segments, seen, grid.sample)
     final = found_theta(simulator, added)
     if longer := cut_longer(problem, everything, grid, final):
         problem, _ = longer

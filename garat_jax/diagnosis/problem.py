@@ -6,6 +6,7 @@ batched simulation.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Generic, NamedTuple, Protocol, Self, TypeVar
 
@@ -149,7 +150,8 @@ class Problem(Generic[AnySimulator]):
         """Return changes of predictions [..., S, L, num_signals], whitened, [..., S, N]."""
         change = change * self.scale
         change = np.where(np.isfinite(change), change, 0.0)
-        return np.clip(change, -LARGE, LARGE).reshape(*change.shape[:-2], -1)
+        whitened = np.clip(change, -LARGE, LARGE)
+        return whitened.reshape(*change.shape[:-2], math.prod(change.shape[-2:]))
 
     def residual_by(
         self, simulator: AnySimulator, theta: np.ndarray, start: np.ndarray

@@ -119,9 +119,8 @@ def _alone(
     simulator = Simulator(model, effects, grid)
     theta = found_theta(simulator, selected)
     _, segments = choose_horizon(simulator, everything, grid)
-    sample = grid.interval * grid.per_sample
     everywhere = np.ones(len(segments.start), bool)
-    whole = Problem(simulator, segments, everywhere, sample)
+    whole = Problem(simulator, segments, everywhere, grid.sample)
     free = {
         j: _Parameter(selected[slot.effect].named, slot.parameter.name, estimate.unit)
         for j, slot in enumerate(simulator.slots)

@@ -147,9 +147,8 @@ def replay_with(
     shown = range(len(recordings)) if chosen is None else list(chosen)
     segments = cut(recordings, grid, horizon)
     segments = segments.take(np.isin(segments.recording, shown))
-    sample = grid.interval * grid.per_sample
     everywhere = np.ones(len(segments.start), bool)
-    problem = Problem(simulator, segments, everywhere, sample)
+    problem = Problem(simulator, segments, everywhere, grid.sample)
     settled = settle(problem, simulator.base, segments.start)
     residual = settled.residual.reshape(segments.measured.shape)
     of_state = signals(simulator.host)[: segments.measured.shape[2]]

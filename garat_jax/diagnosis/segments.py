@@ -119,6 +119,11 @@ class Grid:
         """Seconds of one physics substep."""
         return self.interval / self.substeps
 
+    @property
+    def sample(self) -> float:
+        """Seconds between samples."""
+        return self.interval * self.per_sample
+
 
 def choose_grid(recordings: Sequence[Recording], timestep: float) -> Grid:
     """Match the physics to the sampling.

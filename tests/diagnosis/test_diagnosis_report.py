@@ -294,7 +294,7 @@ def what_is_left(model, recordings, selected):
     simulator = Simulator(repaired(model, selected), (), grid)
     segments = cut(recordings, grid, 2.0)
     everywhere = np.ones(len(segments.start), bool)
-    problem = Problem(simulator, segments, everywhere, grid.interval * grid.per_sample)
+    problem = Problem(simulator, segments, everywhere, grid.sample)
     settled = settle(problem, simulator.base, segments.start)
     return leftover(problem, settled, recordings, model.compile(engine="mujoco").host.model)
 

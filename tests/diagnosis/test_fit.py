@@ -62,7 +62,7 @@ def make_problem(recordings, candidates, horizon=0.4, model=MODEL, timestep=0.00
     segments = cut(recordings, grid, horizon)
     fitted = np.ones(len(segments.start), bool)
     simulator = Simulator(model, candidates, grid)
-    return Problem(simulator, segments, fitted, grid.interval * grid.per_sample)
+    return Problem(simulator, segments, fitted, grid.sample)
 
 
 def candidates():
@@ -95,6 +95,13 @@ def test_a_segment_in_the_middle_knows_the_late_commands_before_it():
     s = problem.segments
     predicted = problem.simulator.predict(np.array([[0.02]]), s.start[None], s)[0]
     np.testing.assert_allclose(predicted, s.measured, atol=1e-9)
+
+
+def test_no_candidates_make_no_changes():
+    problem = make_problem([record(UNIFORM)], ())
+    shape = problem.segments.measured.shape
+    whitened = problem.whiten_change(np.zeros((0, *shape)))
+    assert whitened.shape == (0, shape[0], shape[1] * shape[2])
 
 
 def test_a_fit_recovers_a_parameter_and_its_interval_covers_it():
