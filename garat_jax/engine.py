@@ -123,6 +123,8 @@ class HostModel:
             [state.time[None], state.qpos, state.qvel, state.act, state.qacc_warmstart]
         )
         control = jnp.concatenate([commands, forces], axis=1)
+        # MuJoCo would take commands that are not finite for 0; MJX goes on to what is not finite.
+        row = jnp.where(jnp.isfinite(control).all(), row, jnp.nan)
         inputs = {"row": row, "control": control, **fields}
         dtype = str(row.dtype)
         result = host_call.call(

@@ -1,8 +1,8 @@
 """Batches of experience, evaluation, recorded transitions: all in guarded steps.
 
 A world whose physics leaves the finite numbers ends its episode (`env.guarded_step`). The step is
-counted wherever worlds are stepped, and the first one of a batch of experience is kept as it was,
-so that nothing is hidden.
+counted wherever worlds are stepped, and the first one of a batch of experience, on the first device
+that has one, is kept as it was, so that nothing is hidden.
 """
 
 import functools

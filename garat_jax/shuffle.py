@@ -1,4 +1,4 @@
-"""Random orders and picks for minibatches."""
+"""Sizes, random orders and picks of minibatches."""
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +6,18 @@ import jax.numpy as jnp
 WORD = 32
 MOST = 1 << WORD // 2
 """Most numbers for which half of a word's bits are left to draw the order."""
+
+
+def minibatch_size(total: int, num_minibatches: int) -> int:
+    """Return how many of so many steps each minibatch has; a rest is left out.
+
+    Raises:
+        ValueError: There are more minibatches than steps.
+    """
+    size = total // num_minibatches
+    if not size:
+        raise ValueError(f"a batch of {total} steps cannot make {num_minibatches} minibatches")
+    return size
 
 
 def shuffled(key: jax.Array, num: int) -> jax.Array:

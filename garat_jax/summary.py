@@ -46,7 +46,8 @@ def summarise(
         curve: The logged lines of the grounding.
         target_transitions: How many target transitions the method saw.
         num_episodes: Episodes that each mean return is of.
-        env_steps: Environment steps by stage, [seeds].
+        env_steps: Environment steps that each policy saw, [seeds]; those of the source policy that
+            it came from are among them.
         seconds: Wall time spent compiling and running.
     """
     source, target = returns["source_policy"], returns["target_policy"]

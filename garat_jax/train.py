@@ -148,9 +148,10 @@ class Trainer:
         folder = self.run.path(f"checkpoints/{stage}")
         saved = reported = time.monotonic()
         progress = (first, state)  # one name, so that an interrupt never parts the two
+        is_over = first >= num_iterations
         try:
             with deferred_interrupt() as interrupted:
-                while progress[0] < num_iterations and not interrupted():
+                while not is_over and not interrupted():
                     iteration, last = progress[0] + 1, progress[1]
                     new, metrics, finite = step(last, params)
                     metrics = {name: np.asarray(value) for name, value in metrics.items()}
@@ -164,15 +165,20 @@ class Trainer:
                     if now - saved > CHECKPOINT_SECONDS:
                         saved = now
                         self._save(folder, *progress)
-                    if "finished" in metrics and metrics["finished"].all():
-                        break
+                    is_finished = "finished" in metrics and bool(metrics["finished"].all())
+                    is_over = is_finished or iteration >= num_iterations
         except KeyboardInterrupt:
-            self._save(folder, *progress)
+            self._keep(stage, *progress, is_over)
             raise
-        self._save(folder, *progress)
-        self.run.write_json(_done(stage), {"iterations": progress[0]})
+        self._keep(stage, *progress, is_over)
         self._report(stage, progress[0], progress[0], None)
         return progress[1]
+
+    def _keep(self, stage: str, iteration: int, state, is_over: bool) -> None:
+        """Save a stage as it is left: over, or to be resumed."""
+        self._save(self.run.path(f"checkpoints/{stage}"), iteration, state)
+        if is_over:
+            self.run.write_json(_done(stage), {"iterations": iteration})
 
     def _save(self, folder, iteration: int, state) -> None:
         latest = checkpoint.latest_step(folder)

@@ -165,7 +165,7 @@ class Experiment:
             step,
             self.map(start, _fold(self.keys, stage)),
             world.params,
-            config.max_iterations or config.pair.max_iterations,
+            config.pair.max_iterations if config.max_iterations is None else config.max_iterations,
             world,
         )
 

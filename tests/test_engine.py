@@ -1,11 +1,17 @@
-"""What C MuJoCo is spared in every step."""
+"""What C MuJoCo is spared in every step, and what it is not to take for a number."""
 
+from functools import partial
+
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from garat_jax import dynamics, engine
 from garat_jax.engine import profiling_clock
+from garat_jax.env import guarded_step, make_world
+from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from tests.models import ARM, spec
 
 
@@ -32,6 +38,17 @@ def test_a_model_of_one_tree_is_not_searched_for_islands_and_no_clock_is_read():
     finally:
         clock.value = None
     np.testing.assert_array_equal(timed.qpos, dynamics.step(world, state, still).qpos)
+
+
+@pytest.mark.parametrize("name", ["mujoco", "mjx"])
+def test_a_command_that_is_no_number_is_a_faulty_step(name):
+    world = make_world(InvertedPendulum(), engine=name)
+    state = world.env.reset(world.params, jax.random.key(0))
+    step = jax.jit(partial(guarded_step, world.env))
+    for action, faulty in ((0.5, False), (np.nan, True)):
+        found = step(world.params, state, jnp.full(1, action), jax.random.key(1))
+        assert found.faulty == faulty
+        assert found.result.reward == (not faulty)
 
 
 def test_a_clock_of_the_users_own_is_left_alone():

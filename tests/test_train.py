@@ -1,7 +1,9 @@
 """The host loop with tiny learners: resume, stop on NaN, stop when solved, compiler options."""
 
 import dataclasses
+import os
 import shutil
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -88,6 +90,31 @@ def test_interrupted_and_resumed_is_uninterrupted_bit_for_bit(tmp_path, kind):
     assert lines(cut) == lines(whole)
     assert [line["step"] for line in lines(whole)] == [1, 2, 3, 4, 5, 6]
     assert all(len(line["mean"]) == 2 for line in lines(whole))
+
+
+class Pressed(RunDirectory):
+    """A run in whose second iteration somebody presses Ctrl-C."""
+
+    def log(self, step, **metrics):
+        super().log(step, **metrics)
+        if step == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_interrupted_as_it_is_finished_a_stage_is_over(tmp_path):
+    walk, start = learner()
+
+    def counted(state, params):
+        (position, key), metrics = walk(state[:2], params)
+        count = state[2] + 1
+        return (position, key, count), metrics | {"finished": count == 2}
+
+    begin = (*start, jnp.zeros(2, int))
+    with pytest.raises(KeyboardInterrupt):
+        trainer(directory(tmp_path / "run", Pressed)).train("walk", counted, begin, 0.1, 9)
+    resumed = directory(tmp_path / "run", resume=True)
+    trainer(resumed).train("walk", counted, begin, 0.1, 9)
+    assert [line["step"] for line in lines(resumed)] == [1, 2]
 
 
 def test_a_stage_that_is_over_is_not_run_again(tmp_path):

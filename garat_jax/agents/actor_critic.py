@@ -13,7 +13,7 @@ from garat_jax.agents import advantage
 from garat_jax.env import Env, EnvState
 from garat_jax.networks import GaussianPolicy, ValueNet, forward
 from garat_jax.rollout import Fault
-from garat_jax.shuffle import shuffled
+from garat_jax.shuffle import minibatch_size, shuffled
 from garat_jax.types import Number, Params, Policy, Transition
 
 
@@ -173,8 +173,6 @@ def minibatches(batch: Batch, key: jax.Array, num_minibatches: int) -> Batch:
         ValueError: There are more minibatches than steps.
     """
     total = batch.action.shape[0]
-    size = total // num_minibatches
-    if not size:
-        raise ValueError(f"a batch of {total} steps cannot make {num_minibatches} minibatches")
+    size = minibatch_size(total, num_minibatches)
     order = shuffled(key, total)[: size * num_minibatches]
     return jax.tree.map(lambda x: x[order].reshape(num_minibatches, size, *x.shape[1:]), batch)

@@ -157,7 +157,7 @@ def ground(
         UserError: As `choose_bounds` and `control_steps`.
     """
     fitted, held_out, how = split(recordings, holdout)
-    bounds = choose_bounds(model, fitted, interval)
+    bounds = choose_bounds(model, fitted, interval, held_out)
     rng = np.random.default_rng(seed)
     seen = draw(control_steps(fitted, bounds.interval), config.num_transitions, rng)
     unseen = draw(control_steps(held_out, bounds.interval), config.num_held_out, rng)
@@ -234,8 +234,9 @@ def _learn(lesson: Lesson, config: GroundConfig, reach: float, trainer: Trainer)
     state = trainer.call(init, keys, world, agent_params, target, options=options)
     quiet = env.without_noise()  # the recorded states have theirs already
     grounded = GroundedEnv(quiet, method.transform)
-    recorded = trainer.call(lambda w: as_recorded(quiet, w, unseen), world, options=options)
-    errors = _errors(quiet, world, recorded, trainer, options)
+    free = quiet.unbounded()  # held-out commands may go further than those to learn from
+    recorded = trainer.call(lambda w: as_recorded(free, w, unseen), world, options=options)
+    errors = _errors(free, world, recorded, trainer, options)
     start = jax.vmap(quiet.at, (None, 0))
     starts = trainer.call(start, world, jnp.asarray(paths.start, jnp.float32), options=options)
     as_it_is = trainer.call(

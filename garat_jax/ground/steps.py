@@ -26,7 +26,10 @@ class Bounds(NamedTuple):
 
 
 def choose_bounds(
-    model: Model, recordings: Sequence[Recording], interval: float | None = None
+    model: Model,
+    recordings: Sequence[Recording],
+    interval: float | None = None,
+    holdout: Sequence[Recording] = (),
 ) -> Bounds:
     """Choose the control interval and the range of commands that the transformer may use.
 
@@ -34,8 +37,9 @@ def choose_bounds(
 
     Args:
         model: The model.
-        recordings: What was measured.
+        recordings: What is learned from.
         interval: Seconds of a control step; by default about `INTERVAL`, in whole samples.
+        holdout: What is held out: its samples are to be no farther apart than that, too.
 
     Raises:
         UserError: The model has no actuator, the interval is shorter than a sample, or an actuator
@@ -47,14 +51,16 @@ def choose_bounds(
             f"{model.path} has no actuator, and an action transformer changes commands; "
             "garat diagnose finds what is missing in passive motion"
         )
-    sample = max(r.interval for r in recordings)
+    sample = max(r.interval for r in (*recordings, *holdout))
     if interval is None:
         interval = sample * max(1, round(INTERVAL / sample))
     if interval < (1 - 1e-3) * sample:
         raise UserError(f"--interval {interval:g}: expected at least a sample, {sample:.4g} s")
-    ctrl = np.concatenate([r.ctrl for r in recordings])
+    limited = host.actuator_ctrllimited.astype(bool)
+    lowest, highest = np.where(limited, host.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
+    ctrl = np.clip(np.concatenate([r.ctrl for r in recordings]), lowest, highest)
     low, high = ctrl.min(axis=0), ctrl.max(axis=0)
-    room, limited = (high - low) / 2, host.actuator_ctrllimited.astype(bool)
+    room = (high - low) / 2
     for i in np.flatnonzero(room == 0):
         if not limited[i]:
             raise UserError(
@@ -62,10 +68,7 @@ def choose_bounds(
                 "ctrlrange, so nothing says how far commands may go: give it a ctrlrange"
             )
     room = np.where(room == 0, np.inf, room)
-    reach = np.where(limited[:, None], host.actuator_ctrlrange, [-np.inf, np.inf])
-    return Bounds(
-        interval, np.maximum(low - room, reach[:, 0]), np.minimum(high + room, reach[:, 1])
-    )
+    return Bounds(interval, np.maximum(low - room, lowest), np.minimum(high + room, highest))
 
 
 def control_steps(recordings: Sequence[Recording], interval: float) -> Steps:

@@ -24,7 +24,7 @@ from garat_jax.methods.grounded import (
     decode_action,
 )
 from garat_jax.networks import Discriminator, forward
-from garat_jax.shuffle import picked, shuffled
+from garat_jax.shuffle import minibatch_size, picked, shuffled
 from garat_jax.types import Metrics, Params, Policy, Transition
 
 
@@ -169,7 +169,7 @@ class GARAT:
     def _update_discriminator(self, reward: RewardParams, optimiser, grounded, wanted, key):
         grounded_key, target_key, penalty_key = jax.random.split(key, 3)
         num = self.config.num_minibatches
-        size = grounded.shape[0] // num
+        size = minibatch_size(grounded.shape[0], num)
         order = shuffled(grounded_key, grounded.shape[0])[: num * size]
         picks = picked(target_key, num * size, wanted.shape[0])
         batches = [data.reshape(num, size, -1) for data in (grounded[order], wanted[picks])]

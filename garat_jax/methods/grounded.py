@@ -59,10 +59,15 @@ class GroundedEnv(Env):
         self, params: Grounding, state: EnvState, action: jax.Array, key: jax.Array
     ) -> StepResult:
         """Step the environment with the transformed action; the agent is paid for its own."""
+        return self.step_sending(params, state, action, action, key)
+
+    def step_sending(
+        self, params: Grounding, state: EnvState, action: jax.Array, sent: jax.Array, key: jax.Array
+    ) -> StepResult:
+        """Send what the transformer makes of an action that replaces the one asked for."""
         transform_key, key = jax.random.split(key)
-        action = self.env.clip(action)
-        sent = self.transform(params.transformer, state.obs, action, transform_key)
-        return self.env.step_sending(params.env, state, action, sent, key)
+        sent = self.transform(params.transformer, state.obs, self.env.clip(sent), transform_key)
+        return self.env.step_sending(params.env, state, self.env.clip(action), sent, key)
 
     def idle(self, params: Grounding, state: EnvState) -> EnvState:
         """Return a state in which the environment idles."""

@@ -127,6 +127,13 @@ class RecordedEnv(Env):
         quiet.noise = np.zeros_like(self.noise)
         return quiet
 
+    def unbounded(self) -> "RecordedEnv":
+        """Return the same environment for any commands; the model's `ctrlrange` still holds."""
+        free = copy.copy(self)
+        free.action_low = np.full_like(self.action_low, -np.inf)
+        free.action_high = np.full_like(self.action_high, np.inf)
+        return free
+
     def _with_noise(self, obs: jax.Array, key: jax.Array) -> jax.Array:
         return obs + jnp.asarray(self.noise, obs.dtype) * jax.random.normal(key, obs.shape)
 
@@ -149,7 +156,10 @@ class Clone(NamedTuple):
 
 
 def clone(env: Env, steps: Steps) -> Clone:
-    """Return the parameters with which `cloned(env)` acts as recorded in steps in any order."""
+    """Return the parameters with which `cloned(env)` acts as recorded in some steps.
+
+    Of more than `MOST_STATES` it remembers the first: they should be drawn at random.
+    """
     steps = Steps(*(column[:MOST_STATES] for column in steps))
     seen = np.asarray(env.features(jnp.asarray(steps.state)))
     spread = seen.std(axis=0) + 1e-6

@@ -97,6 +97,14 @@ def test_what_looks_like_the_target_is_paid_more(told_apart):
     assert (np.median(like_source) < like_target).mean() > 0.9
 
 
+def test_more_minibatches_than_steps_are_refused():
+    config = dataclasses.replace(SMALL, num_minibatches=513)  # of 16 times 32 steps
+    target = flat(record(TARGET, 1).transitions)
+    garat, state = start(config, target)
+    with pytest.raises(ValueError, match="a batch of 512 steps cannot make 513 minibatches"):
+        jax.eval_shape(garat.step, state, SOURCE, (), target)
+
+
 def test_centred_rewards_have_mean_zero_over_the_batch(told_apart):
     _, final, metrics = told_apart
     np.testing.assert_allclose(metrics["rewards"].mean(axis=1), 0, atol=1e-4)

@@ -178,6 +178,18 @@ def test_the_agent_is_paid_for_what_it_asks_for_as_on_the_machine():
     assert sent.reward - result.reward == pytest.approx(0.1 * 6 * (1.0 - 0.25), rel=1e-4)
 
 
+def test_through_two_transformers_the_agent_is_paid_for_its_own_action_still():
+    world = make_world(HalfCheetah(), engine="mujoco")
+    state, action = world.env.reset(world.params, jax.random.key(0)), jnp.ones(6)
+    once = GroundedEnv(world.env, lambda scale, obs, action, key: scale * action)
+    twice = GroundedEnv(once, once.transform)
+    quarter, half = (Grounding(world.params, jnp.asarray(x)) for x in (0.25, 0.5))
+    expected = once.step(quarter, state, action, jax.random.key(1))
+    found = twice.step(Grounding(half, jnp.asarray(0.5)), state, action, jax.random.key(1))
+    np.testing.assert_array_equal(found.state.obs, expected.state.obs)
+    assert found.reward == expected.reward
+
+
 def test_a_grounded_environment_idles_as_its_own_does():
     world = make_world(HalfCheetah(), engine="mujoco")
     grounded = GroundedEnv(world.env, lambda params, obs, action, key: action)
