@@ -44,7 +44,8 @@ def train(name, mesh):
 mesh = split.make_mesh(num_seeds, 8)
 print(dict(mesh.shape))
 pairs = zip(*map(jax.tree.leaves, (train("whole", None), train("split", mesh))), strict=True)
-gaps = [np.abs(np.asarray(a, float) - np.asarray(b, float)).max() for a, b in pairs if a.size]
+pairs = [(np.asarray(a, float), np.asarray(b, float)) for a, b in pairs if a.size]
+gaps = [(np.abs(a - b) / np.maximum(1.0, np.abs(a))).max() for a, b in pairs]
 print(max(gaps))
 """
 
