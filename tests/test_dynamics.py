@@ -274,7 +274,10 @@ def test_other_warnings_of_mujoco_are_logged_aloud_and_once(monkeypatch, caplog)
     world = compiled(PENDULUM, engine="mujoco")
     state = dynamics.initial_state(world, jnp.zeros(1), jnp.zeros(1))
     for _ in range(2):
-        dynamics.step(world, state, jnp.full(1, jnp.nan), 4).qvel.block_until_ready()
+        data = mujoco.MjData(world.host.model)
+        data.ctrl[:] = np.nan
+        mujoco.mj_step(world.host.model, data)
+        dynamics.step(world, state, jnp.zeros(1), 4).qvel.block_until_ready()
     (record,) = [record for record in caplog.records if record.name == "garat_jax.engine"]
     assert record.levelno == logging.WARNING and "CTRL" in record.getMessage()
 
