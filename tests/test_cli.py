@@ -1,6 +1,7 @@
 import dataclasses
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -68,15 +69,26 @@ def test_version():
         (["transfer", "x", "--sedes=2"], ["'--sedes'", "did you mean --seeds"]),
         (["transfer"], ["Missing", "PAIR"]),
         (["transfer", "x", "y"], ["Unrecognized", "y"]),
-        (["transfer", "x", "--seeds", "many"], ["--seeds", "'many'"]),
+        (["transfer", "x", "--seeds", "many"], ["--seeds 'many': expected a whole number"]),
+        (["transfer", "x", "--seeds=1.5"], ["--seeds '1.5': expected a whole number"]),
+        (["ground", "x", "y", "--interval", "abc"], ["--interval 'abc': expected a number"]),
         (["transfer", "x", "--seeds"], ["Missing value", "--seeds"]),
         (["transfer", "x", "--seeds", "0"], ["--seeds 0", "1 or more"]),
+        (["transfer", "x", "--seeds", "2", "--seeds=3"], ["--seeds is given twice"]),
+        (["compare", "x", "y", "--out", "a", "--out", "b"], ["--out is given twice"]),
+        (["compare", "x", "y", "--also", "--force"], ["--also: expected one value or more"]),
+        (["compare", "x", "y", "--also"], ["--also: expected one value or more"]),
         (["transfer", "x", "--engine", "mjxx"], ["'mjxx'", "'auto', 'mjx', 'mujoco'"]),
         (["transfer", "x", "--distributed", "--resume"], ["--distributed", "leave out --resume"]),
         (["transfer", "x", "--process-id", "1"], ["--process-id", "with --distributed"]),
         (["transfer", "x", "--device", "abacus"], ["'abacus'", "'auto', 'cpu', 'gpu', 'tpu'"]),
         (["compare", "no.xml", "no.csv"], ["MODEL", "there is no file no.xml"]),
         (["compare", __file__], ["DATA", "one file or more"]),
+        (["compare", "--also", __file__, __file__], ["DATA", "files that belong to none first"]),
+        (
+            ["compare", __file__, __file__, "--also", "no.xml", "--also", __file__],
+            ["--also: there is no file no.xml"],
+        ),
         (["compare", __file__, "no.csv"], ["DATA", "there is no file no.csv"]),
         (["compare", __file__, "."], ["DATA", ". is a folder; name the files in it"]),
         (["diagnose", __file__, "no.csv"], ["DATA", "there is no file no.csv"]),
@@ -182,6 +194,15 @@ def test_a_run_of_several_processes_cannot_go_on():
 def test_arguments_reach_the_command():
     command = parse(["transfer", "p", "--seeds", "3", "--resume"], cli.COMMANDS, "")
     assert command == cli.Transfer("p", seeds=3, resume=True)
+
+
+def test_a_list_option_may_be_given_in_several_places():
+    words = "m.xml d.csv --holdout a.csv b.csv --force --effects=e.py --holdout=c.csv --force"
+    command = parse(["diagnose", *words.split()], cli.COMMANDS, "")
+    holdout = tuple(map(Path, ("a.csv", "b.csv", "c.csv")))
+    data, effects = (Path("d.csv"),), (Path("e.py"),)
+    expected = cli.Diagnose(Path("m.xml"), data, effects=effects, force=True, holdout=holdout)
+    assert command == expected
 
 
 def test_nearest_is_closest_first_and_ignores_case():

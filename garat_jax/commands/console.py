@@ -103,7 +103,10 @@ def _check_outside(command: Any, out: Path) -> None:
 def check_files(paths: Sequence[Path], what: str) -> None:
     """Refuse an empty list of files and files that are not there."""
     if not paths:
-        raise UserError(f"{what}: expected one file or more")
+        raise UserError(
+            f"{what}: expected one file or more; an option that takes several words takes all up to "
+            "the next option, so put files that belong to none first"
+        )
     for path in paths:
         if path.is_dir():
             raise UserError(f"{what}: {path} is a folder; name the files in it")

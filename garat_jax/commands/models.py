@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +10,7 @@ from tyro.conf import Positional
 
 from garat_jax.commandline import arg
 from garat_jax.commands.console import check_files, check_optional, check_out, print_table, say
-from garat_jax.errors import UserError, choose
+from garat_jax.errors import UserError
 
 if TYPE_CHECKING:
     from garat_jax.effects import Effect
@@ -43,7 +44,7 @@ class Add:
         check_files([self.model], "MODEL")
         check_files(self.fit or [self.model], "--fit")
         check_optional(self.map, "--map")
-        values = dict(_assignment(text) for text in self.set)
+        values = _assignments(self.set)
         check_out(self.out, ".toml", self.force)
         from garat_jax.diagnosis import load_model
         from garat_jax.diagnosis.add import add
@@ -121,18 +122,18 @@ class Convert:
 class Effects:
     """Print the catalogue of physical effects: law, parameters, units, what identifies them."""
 
-    effect: Annotated[Positional[str | None], arg(metavar="EFFECT")] = None
+    effect: Annotated[Positional[str | None], arg(metavar="[EFFECT]")] = None
     """Print all there is to know about one effect."""
     effects: Annotated[tuple[Path, ...], arg(metavar="FILE.py...")] = ()
     """Python files with effects of your own."""
 
     def run(self) -> None:
         """Print the catalogue, or one entry."""
-        from garat_jax.effects.catalogue import load_catalogue
+        from garat_jax.effects.catalogue import choose_kind, load_catalogue
 
         catalogue = load_catalogue(self.effects)
         if self.effect is not None:
-            _print_effect(choose("effect", self.effect, catalogue))
+            _print_effect(choose_kind(self.effect, catalogue))
             return
         rows = [
             (
@@ -147,15 +148,22 @@ class Effects:
         print_table(("effect", "acts on", "law", "parameters", "identified by"), rows)
 
 
-def _assignment(text: str) -> tuple[str, float]:
-    """Split `name=value`."""
-    name, equals, value = text.partition("=")
-    try:
-        if name and equals:
-            return name, float(value)
-    except ValueError:
-        pass
-    raise UserError(f"--set {text!r}: expected NAME=VALUE with a number, such as torque=0.2")
+def _assignments(texts: Sequence[str]) -> dict[str, float]:
+    """Read `name=value` words."""
+    values = dict[str, float]()
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if name in values:
+            raise UserError(f"--set gives {name} twice; expected it once")
+        try:
+            values[name] = float(value)
+        except ValueError:
+            equals = ""
+        if not name or not equals:
+            raise UserError(
+                f"--set {text!r}: expected NAME=VALUE with a number, such as torque=0.2"
+            )
+    return values
 
 
 def _print_effect(effect: "type[Effect]") -> None:

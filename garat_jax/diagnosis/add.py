@@ -31,7 +31,8 @@ from garat_jax.diagnosis.units import after_number
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect, unit_at
 from garat_jax.effects.bounds import check_bounds
-from garat_jax.errors import UserError, choose
+from garat_jax.effects.catalogue import choose_kind
+from garat_jax.errors import UserError
 
 
 class Sized(NamedTuple):
@@ -143,7 +144,7 @@ def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, flo
         UserError: The kind, the target or a parameter is unknown, a value is outside its bounds, or
             the model has this effect already.
     """
-    cls = choose("effect", kind, model.catalogue)
+    cls = choose_kind(kind, model.catalogue)
     effect = make_effect(cls, target, values)
     host = native_model(model.compile(engine="mujoco"))
     effect.check(host)

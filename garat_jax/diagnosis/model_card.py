@@ -18,7 +18,7 @@ from garat_jax.diagnosis.own_effects import try_own
 from garat_jax.dynamics import Dynamics, Override, compile
 from garat_jax.effects import CATALOGUE, Effect
 from garat_jax.effects.bounds import check_bounds
-from garat_jax.effects.catalogue import Catalogue, load_catalogue
+from garat_jax.effects.catalogue import Catalogue, choose_kind, load_catalogue
 from garat_jax.effects.elements import element_names
 from garat_jax.env import Task, TaskEnv, Transform, World
 from garat_jax.errors import UserError, unknown_name
@@ -251,9 +251,7 @@ def _effect(table: dict[str, Any], catalogue: Catalogue) -> Effect:
     kind, target, parameters = (table[key] for key in EFFECT_KEYS)
     if not isinstance(kind, str) or not isinstance(target, str) or not isinstance(parameters, dict):
         raise UserError("[[effect]] needs names for kind and target and a table of parameters")
-    if kind not in catalogue:
-        raise UserError(f"{unknown_name('effect', kind, catalogue)}; --effects FILE.py adds others")
-    return make_effect(catalogue[kind], target, parameters)
+    return make_effect(choose_kind(kind, catalogue), target, parameters)
 
 
 def make_effect(cls: type[Effect], target: str, parameters: Mapping[str, Any]) -> Effect:

@@ -22,8 +22,9 @@ from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
+from garat_jax.effects.catalogue import choose_kind
 from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
-from garat_jax.errors import UserError, choose, unknown_name
+from garat_jax.errors import UserError, unknown_name
 from garat_jax.report import styled
 
 RATE = 100.0
@@ -100,7 +101,7 @@ def parse_place(text: str, model: Model) -> Place:
         UserError: There is no such kind or target, or the target has to be named.
     """
     kind, _, target = text.partition("@")
-    cls = choose("effect", kind, model.catalogue)
+    cls = choose_kind(kind, model.catalogue)
     targets = cls.targets(model.compile(engine="mujoco").host.model)
     if target and target not in targets:
         raise unknown_name(f"target of {kind}", target, targets)

@@ -59,7 +59,8 @@ NONE = (
 """Of one kind at two geoms that make one contact."""
 UNKNOWN = (
     "no experiment is known that tells {first} from {second}; garat plan MODEL --separate "
-    "{first_place} {second_place} looks for commands that do, and says how far they do"
+    "{first_place} {second_place} --out plan.csv looks for commands that do, and says how far "
+    "they do"
 )
 """Of other pairs, where there are commands."""
 UNKNOWN_PASSIVE = (

@@ -13,7 +13,7 @@ from types import ModuleType
 from garat_jax.effects import CATALOGUE
 from garat_jax.effects.base import Effect
 from garat_jax.effects.elements import OBJECT_TYPES
-from garat_jax.errors import UserError
+from garat_jax.errors import UserError, choose
 
 ENTRY_POINTS = "garat_jax.effects"
 """Group of entry points; each names a subclass of `Effect`."""
@@ -45,6 +45,18 @@ def load_catalogue(files: Sequence[str | Path] = ()) -> dict[str, type[Effect]]:
             raise UserError(f"{path}: holds no effect; expected a class Mine(Effect) with a kind")
         _add(catalogue, classes, str(path))
     return catalogue
+
+
+def choose_kind(kind: str, catalogue: Catalogue) -> type[Effect]:
+    """Return the effect of a catalogue that has a name.
+
+    Raises:
+        UserError: There is none.
+    """
+    try:
+        return choose("effect", kind, catalogue)
+    except UserError as error:
+        raise UserError(f"{error}; --effects FILE.py adds others") from None
 
 
 def run_python(path: Path, option: str) -> ModuleType:

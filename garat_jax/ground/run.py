@@ -6,15 +6,17 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import plotly.graph_objects as go
 
 from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.export import copy_model
+from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, load_model, save_card
 from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.report_data import side_by_side_section
-from garat_jax.effects.catalogue import Catalogue, run_python
+from garat_jax.effects.catalogue import Catalogue, line_in, run_python
 from garat_jax.errors import UserError
 from garat_jax.ground.learn import Grounded, ground
 from garat_jax.ground.source import CARD, SUMMARY
@@ -58,8 +60,8 @@ def run_ground(
         UserError: A file cannot be read, does not fit the model, or cannot be copied.
     """
     loaded = load_model(model, catalogue)
-    acting = load_policy(policy, loaded) if policy else None
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
+    acting = load_policy(policy, loaded, recordings) if policy else None
     run.record_settings(config)
     done = ground(
         loaded,
@@ -80,14 +82,20 @@ def run_ground(
     return done
 
 
-def load_policy(path: Path, model: Model) -> Policy:
+def load_policy(path: Path, model: Model, recordings: Sequence[Recording]) -> Policy:
     """Read a policy from a Python file, which is run: `def policy(obs, key)` that JAX can trace.
 
     It is given (qpos, qvel) as the sensors report them, [nq + nv], and a PRNG key, and returns the
     command, [nu].
 
+    Args:
+        path: The file.
+        model: The model that it acts in.
+        recordings: What it has to have a command for.
+
     Raises:
-        UserError: The file fails, has no such function, or the function returns something else.
+        UserError: The file fails, has no such function, or the function returns something else, or
+            no finite number in some recorded state.
     """
     function = getattr(run_python(path, "--policy"), "policy", None)
     if not callable(function):
@@ -97,13 +105,31 @@ def load_policy(path: Path, model: Model) -> Policy:
     try:
         command = jax.eval_shape(function, obs, jax.random.key(0))
     except Exception as error:
+        where = f"{path}{line_in(path, error)}"
+        if isinstance(error, jax.errors.ConcretizationTypeError):
+            raise UserError(
+                f"{where}: policy(obs, key) takes a decision by a number that is not known while "
+                "JAX traces it; write it with jnp.where"
+            ) from error
         line = " ".join(str(error).split())
-        raise UserError(f"{path}: policy(obs, key): {type(error).__name__}: {line}") from error
+        raise UserError(f"{where}: policy(obs, key): {type(error).__name__}: {line}") from error
     if getattr(command, "shape", None) != (host.nu,):
         raise UserError(
             f"{path}: policy(obs, key) returns {command}; expected an array of {host.nu} "
             f"command{'s' if host.nu > 1 else ''}, shape ({host.nu},)"
         )
+
+    for recording in recordings:
+        states = jnp.concatenate([recording.qpos, recording.qvel], axis=1, dtype="float32")
+        commands = jax.vmap(function, (0, None))(states, jax.random.key(0))
+        wrong = ~np.isfinite(commands).all(axis=1)
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            raise UserError(
+                f"{path}: policy(obs, key) returns {np.asarray(commands[i]).tolist()} at "
+                f"{recording.time[i]:.4g} s of {recording.name}, where obs is "
+                f"{np.round(states[i], 4).tolist()}; expected finite numbers"
+            )
 
     def policy(params: Params, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         del params

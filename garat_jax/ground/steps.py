@@ -42,8 +42,8 @@ def choose_bounds(
         holdout: What is held out: its samples are to be no farther apart than that, too.
 
     Raises:
-        UserError: The model has no actuator, the interval is shorter than a sample, or an actuator
-            has neither a `ctrlrange` nor commands that change.
+        UserError: The model has no actuator, the interval is shorter than a sample or no finite
+            number, or an actuator has neither a `ctrlrange` nor commands that change.
     """
     host = model.compile(engine="mujoco").host.model
     if host.nu == 0:
@@ -54,8 +54,11 @@ def choose_bounds(
     sample = max(r.interval for r in (*recordings, *holdout))
     if interval is None:
         interval = sample * max(1, round(INTERVAL / sample))
-    if interval < (1 - 1e-3) * sample:
-        raise UserError(f"--interval {interval:g}: expected at least a sample, {sample:.4g} s")
+    if not (1 - 1e-3) * sample <= interval < np.inf:
+        raise UserError(
+            f"--interval {interval:g}: expected a number of seconds, a sample, {sample:.4g} s, "
+            "at least"
+        )
     limited = host.actuator_ctrllimited.astype(bool)
     lowest, highest = np.where(limited, host.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
     ctrl = np.clip(np.concatenate([r.ctrl for r in recordings]), lowest, highest)

@@ -87,6 +87,10 @@ def test_a_second_effect_keeps_the_first(pendulum):
         (["coulomb_friction", "--at", "joint/hinge", "--set", "torqe=1"], "did you mean torque?"),
         (["coulomb_friction", "--at", "joint/hinge", "--set", "torque"], "expected NAME=VALUE"),
         (["coulomb_friction", "--at", "joint/hinge", "--set", "torque=x"], "expected NAME=VALUE"),
+        (
+            ["payload_mass", "--at", "body/pole", "--set", "mass=1", "--set", "mass=2"],
+            "--set gives mass twice; expected it once",
+        ),
         (["coulomb_friction", "--at", "joint/hinge", "--set", "torque=nan"], "finite number"),
         (
             ["coulomb_friction", "--at", "joint/hinge", "--set", "torque=-1"],

@@ -93,12 +93,21 @@ def test_models_of_other_machines_are_not_compared(read, tmp_path):
         ("def policy(obs, key): return obs", r"expected an array of 1 command, shape \(1,\)"),
         ("def policy(obs, key): return obs[9:].nothing", "AttributeError"),
         ("def policy(obs", "line 1: SyntaxError"),
+        ("def policy(obs, key):\n    return obs[:1] if obs[0] > 0 else 0", "line 2: .* jnp.where"),
+        (
+            "def policy(obs, key): return obs[:1] / (obs[0] < 9)",
+            r"mine.py: policy\(obs, key\) returns \[inf\] at 0.096 s of hand.csv, where obs is "
+            r"\[9.0, 0.0\]",
+        ),
     ],
 )
 def test_a_wrong_policy_is_refused(read, tmp_path, text, message):
     (tmp_path / "mine.py").write_text(text)
+    model, (recording, *_) = read
+    qpos = np.where(np.arange(len(recording.time))[:, None] == 12, 9.0, 0.0)
+    moved = dataclasses.replace(recording, name="hand.csv", qpos=qpos, qvel=np.zeros_like(qpos))
     with pytest.raises(UserError, match=message):
-        load_policy(tmp_path / "mine.py", read[0])
+        load_policy(tmp_path / "mine.py", model, [moved])
 
 
 @pytest.fixture(scope="module")
