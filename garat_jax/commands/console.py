@@ -104,8 +104,8 @@ def check_files(paths: Sequence[Path], what: str) -> None:
     """Refuse an empty list of files and files that are not there."""
     if not paths:
         raise UserError(
-            f"{what}: expected one file or more; an option that takes several words takes all up to "
-            "the next option, so put files that belong to none first"
+            f"{what}: expected one file or more; an option that takes several words takes all up "
+            "to the next option, so put files that belong to none first"
         )
     for path in paths:
         if path.is_dir():

@@ -134,3 +134,8 @@ def _check(cls: type[Effect], origin: str) -> None:
                 f"{origin}: {p.name} of {cls.__name__} goes from {p.low:g} to {p.high:g}; expected "
                 "low below high"
             )
+        if not p.low <= p.nominal <= p.high:
+            raise UserError(
+                f"{origin}: {p.name} of {cls.__name__} means no effect at {p.nominal:g}, outside "
+                f"its bounds {p.low:g} to {p.high:g}"
+            )

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +98,7 @@ def load_policy(path: Path, model: Model, recordings: Sequence[Recording]) -> Po
         UserError: The file fails, has no such function, or the function returns something else, or
             no finite number in some recorded state.
     """
-    function = getattr(run_python(path, "--policy"), "policy", None)
+    function: Any = getattr(run_python(path, "--policy"), "policy", None)
     if not callable(function):
         raise UserError(f"{path}: holds no policy; expected a function policy(obs, key)")
     host = model.compile(engine="mujoco").host.model
@@ -121,12 +122,12 @@ def load_policy(path: Path, model: Model, recordings: Sequence[Recording]) -> Po
 
     for recording in recordings:
         states = jnp.concatenate([recording.qpos, recording.qvel], axis=1, dtype="float32")
-        commands = jax.vmap(function, (0, None))(states, jax.random.key(0))
+        commands = np.asarray(jax.vmap(function, (0, None))(states, jax.random.key(0)))
         wrong = ~np.isfinite(commands).all(axis=1)
         if wrong.any():
             i = int(np.argmax(wrong))
             raise UserError(
-                f"{path}: policy(obs, key) returns {np.asarray(commands[i]).tolist()} at "
+                f"{path}: policy(obs, key) returns {commands[i].tolist()} at "
                 f"{recording.time[i]:.4g} s of {recording.name}, where obs is "
                 f"{np.round(states[i], 4).tolist()}; expected finite numbers"
             )

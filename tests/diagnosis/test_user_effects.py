@@ -3,13 +3,16 @@
 import dataclasses
 import importlib.metadata
 
+import mujoco
 import pytest
 
 from garat_jax import cli
 from garat_jax.diagnosis import load_model
 from garat_jax.diagnosis.add import add
 from garat_jax.diagnosis.diagnose import make_candidates
+from garat_jax.diagnosis.own_effects import check_identity
 from garat_jax.diagnosis.view import repaired
+from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import load_catalogue
 from garat_jax.errors import UserError
 from tests import models
@@ -91,6 +94,87 @@ def test_a_mistake_in_a_law_is_one_line_that_says_where(mine, wrong, said):
     assert "\n" not in str(caught.value)
 
 
+LAW = (
+    MINE
+    + """
+    acts = True
+    reads_state = True
+
+    def init(self, host):
+        return jax.numpy.zeros(2)
+
+    def tune(self, model, state, ctrl):
+        return {}
+
+    def apply(self, model, state, ctrl, memory):
+        return RETURNED
+
+    def sense(self, host, state, memory):
+        return state._replace(qpos=state.qpos + SENSED)
+"""
+)
+
+
+@pytest.mark.parametrize(
+    ("returned", "sensed", "said"),
+    [
+        ("ctrl, None, memory", "0", ""),
+        ("ctrl", "0", "line 34): apply returns something else than (command, force or"),
+        ("ctrl[:0], None, memory", "0", "line 34): apply returns the command of shape (0,); "),
+        ("ctrl, ctrl[:0], memory", "0", "apply returns the force of shape (0,); expected (1,)"),
+        ("ctrl, 0.0, memory", "0", "apply returns the force of shape (); expected (1,)"),
+        ("ctrl, None, memory[:1]", "0", "a memory of shape (1,); expected (2,), as of init"),
+        ("ctrl, None, ()", "0", "a memory of shape (); expected (2,), as of init"),
+        ("0.5 * ctrl, None, memory", "0", "at stiffness = 0, which means no effect, apply makes"),
+        ("ctrl, state.qvel, memory", "0", "of 0 in the force; there a law may change nothing"),
+        ("ctrl + jax.numpy.log(self.stiffness), None, memory", "0", "apply makes -inf of"),
+        (
+            "ctrl, None, memory",
+            "jax.numpy.ones(2)",
+            "sense returns qpos of shape (2,); expected (1,)",
+        ),
+        ("ctrl, None, memory", "0.1", "line 37): at stiffness = 0, which means no effect, sense"),
+    ],
+)
+def test_what_a_law_returns_is_checked(mine, returned, sensed, said):
+    mine.write_text(LAW.replace("RETURNED", returned).replace("SENSED", sensed))
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    effect = model.catalogue["my_spring"](target="joint/hinge", stiffness=1.0)
+    if not said:
+        model.compile(engine="mujoco", extra_effects=[effect])
+        return
+    with pytest.raises(UserError) as caught:
+        model.compile(engine="mujoco", extra_effects=[effect])
+    assert str(caught.value).startswith(f"effect my_spring ({mine} line ")
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"jnt_stiffness":', '"jnt_stifness":', "unknown field 'jnt_stifness'; did you mean jnt_"),
+        ('"jnt_stiffness":', '"opt.grvity":', "unknown field 'opt.grvity'"),
+        ('model["jnt_stiffness"]', "jax.numpy.zeros(3)", "of shape (3,); expected (1,)"),
+        ("add(self.stiffness)", "add(1 + self.stiffness)", "fields makes 1 of 0 in jnt_stiffness"),
+    ],
+)
+def test_what_fields_returns_is_checked(mine, old, new, said):
+    assert old in MINE
+    mine.write_text(MINE.replace(old, new))
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    effect = model.catalogue["my_spring"](target="joint/hinge")
+    with pytest.raises(UserError) as caught:
+        model.compile(engine="mujoco", extra_effects=[effect])
+    assert f"({mine} line 21): " in str(caught.value) and said in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", CATALOGUE)
+def test_the_catalogue_passes_for_a_users_own(kind):
+    spec = mujoco.MjSpec.from_string(models.ARM)
+    for target in CATALOGUE[kind].targets(spec.copy().compile())[:2]:
+        check_identity(spec, CATALOGUE[kind], target)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -105,6 +189,7 @@ def test_a_mistake_in_a_law_is_one_line_that_says_where(mine, wrong, said):
         ("class Spring(Effect)", "class Spring", "holds no effect"),
         ("import jax\n", "import sys; sys.exit(7)\n", "line 3: SystemExit: 7"),
         ("high=10.0", "high=-10.0", "stiffness of Spring goes from 0 to -10; expected low below"),
+        ("low=0.0", "low=0.1", "stiffness of Spring means no effect at 0, outside its bounds 0.1"),
     ],
 )
 def test_a_bad_file_is_one_line(mine, capsys, old, new, said):
