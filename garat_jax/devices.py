@@ -111,7 +111,7 @@ def describe(error: Exception) -> UserError:
         reason = "no backend for it is installed; pip install 'garat_jax[cuda]' brings NVIDIA's"
     return UserError(
         f"JAX finds no device {wanted!r} ({reason}); "
-        "choose another with --device or the variable JAX_PLATFORMS"
+        "choose another with the variable JAX_PLATFORMS, or with --device if the command has it"
     )
 
 

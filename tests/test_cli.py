@@ -7,6 +7,7 @@ import pytest
 
 from garat_jax import cli
 from garat_jax.commandline import how_to_go_on, parse
+from garat_jax.commands.console import writing
 from garat_jax.errors import DivergedError, UserError, nearest, unknown_name
 from garat_jax.runs import RunDirectory, earlier_run_kept
 from tests.test_split import free_port
@@ -194,6 +195,21 @@ def test_a_run_of_several_processes_cannot_go_on():
 def test_arguments_reach_the_command():
     command = parse(["transfer", "p", "--seeds", "3", "--resume"], cli.COMMANDS, "")
     assert command == cli.Transfer("p", seeds=3, resume=True)
+
+
+def test_an_output_that_fails_leaves_no_folders_and_is_tried_first(tmp_path):
+    out = tmp_path / "new" / "deep" / "x.csv"
+    with pytest.raises(UserError, match="no luck"), writing(out, ".csv", force=False):
+        raise UserError("no luck")
+    assert list(tmp_path.iterdir()) == []
+    with writing(out, ".csv", force=False):
+        out.touch()
+    with pytest.raises(UserError, match="no luck"), writing(out, ".csv", force=True):
+        raise UserError("no luck")
+    assert out.is_file()
+    under_a_file = out / "new" / "x.csv"
+    with pytest.raises(UserError, match="cannot write to"), writing(under_a_file, ".csv", False):
+        raise AssertionError
 
 
 def test_a_list_option_may_be_given_in_several_places():

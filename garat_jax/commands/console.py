@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import shlex
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -120,15 +121,31 @@ def check_optional(path: Path | None, option: str) -> None:
         check_files([path], option)
 
 
-def check_out(path: Path, suffix: str, force: bool) -> None:
-    """Refuse an output file of another kind, and one that is there already without --force."""
+@contextlib.contextmanager
+def writing(path: Path, suffix: str, force: bool) -> Iterator[None]:
+    """Make sure that an output file can be written, before what takes long.
+
+    Folders that are made for it are removed again if the block fails.
+
+    Raises:
+        UserError: It is of another kind, there already without --force, or cannot be written.
+    """
     if path.suffix.lower() != suffix:
         raise UserError(f"--out {path}: expected a name that ends in {suffix}")
     if path.is_dir():
         raise UserError(f"--out {path} is a folder; expected a file")
     if path.exists() and not force:
         raise UserError(f"{path} exists already: give --force to replace it, or another --out")
+    new = [folder for folder in path.parents if not folder.exists()]
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot make the folder {path.parent}: {error.strerror}") from error
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=path.parent).close()
+        except OSError as error:
+            raise UserError(f"cannot write to {path.parent}: {error.strerror}") from error
+        yield
+    except BaseException:
+        for folder in new:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise

@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from garat_jax.commandline import arg
-from garat_jax.commands.console import check_files, check_optional, check_out, make_run, say
+from garat_jax.commands.console import check_files, check_optional, make_run, say, writing
 from garat_jax.errors import UserError, choose
 
 
@@ -247,16 +247,16 @@ class Plan:
     def run(self) -> None:
         """Plan the excitation."""
         check_files([self.model], "MODEL")
-        check_out(self.out, ".csv", self.force)
         if not 2.0 <= self.seconds <= 600.0:
             raise UserError(f"--seconds {self.seconds:g}: expected 2 to 600")
-        from garat_jax.diagnosis import load_model
-        from garat_jax.diagnosis.plan import plan, write_plan
-        from garat_jax.diagnosis.progress import tell
-        from garat_jax.effects.catalogue import load_catalogue
+        with writing(self.out, ".csv", self.force):
+            from garat_jax.diagnosis import load_model
+            from garat_jax.diagnosis.plan import plan, write_plan
+            from garat_jax.diagnosis.progress import tell
+            from garat_jax.effects.catalogue import load_catalogue
 
-        model = load_model(self.model, load_catalogue(self.effects))
-        planned = plan(model, *self.separate, self.seconds, self.seed, tell)
-        write_plan(planned, self.out)
-        say(str(planned))
-        say(f"excitation: {self.out}")
+            model = load_model(self.model, load_catalogue(self.effects))
+            planned = plan(model, *self.separate, self.seconds, self.seed, tell)
+            write_plan(planned, self.out)
+            say(str(planned))
+            say(f"excitation: {self.out}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from garat_jax.commandline import arg
-from garat_jax.commands.console import check_files, check_optional, check_out, print_table, say
+from garat_jax.commands.console import check_files, check_optional, print_table, say, writing
 from garat_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -45,21 +45,21 @@ class Add:
         check_files(self.fit or [self.model], "--fit")
         check_optional(self.map, "--map")
         values = _assignments(self.set)
-        check_out(self.out, ".toml", self.force)
-        from garat_jax.diagnosis import load_model
-        from garat_jax.diagnosis.add import add
-        from garat_jax.diagnosis.compare import read_recordings
-        from garat_jax.diagnosis.model_card import mjcf_in_card, save_card
-        from garat_jax.diagnosis.progress import tell
-        from garat_jax.effects.catalogue import load_catalogue
+        with writing(self.out, ".toml", self.force):
+            from garat_jax.diagnosis import load_model
+            from garat_jax.diagnosis.add import add
+            from garat_jax.diagnosis.compare import read_recordings
+            from garat_jax.diagnosis.model_card import mjcf_in_card, save_card
+            from garat_jax.diagnosis.progress import tell
+            from garat_jax.effects.catalogue import load_catalogue
 
-        model = load_model(self.model, load_catalogue(self.effects))
-        mjcf_in_card(self.out, model)
-        recordings = read_recordings(model, self.fit, self.map)
-        done = add(model, self.effect, self.at, values, recordings, tell)
-        say(str(done))
-        save_card(self.out, done.model)
-        say(f"model card: {self.out}")
+            model = load_model(self.model, load_catalogue(self.effects))
+            mjcf_in_card(self.out, model)
+            recordings = read_recordings(model, self.fit, self.map)
+            done = add(model, self.effect, self.at, values, recordings, tell)
+            say(str(done))
+            save_card(self.out, done.model)
+            say(f"model card: {self.out}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,18 +78,18 @@ class Export:
     def run(self) -> None:
         """Write the MJCF."""
         check_files([self.model], "MODEL")
-        check_out(self.out, ".xml", self.force)
-        from garat_jax.diagnosis import load_model
-        from garat_jax.diagnosis.export import export_mjcf
-        from garat_jax.effects.catalogue import load_catalogue
+        with writing(self.out, ".xml", self.force):
+            from garat_jax.diagnosis import load_model
+            from garat_jax.diagnosis.export import export_mjcf
+            from garat_jax.effects.catalogue import load_catalogue
 
-        model = load_model(self.model, load_catalogue(self.effects))
-        if self.out.resolve() in (model.path.resolve(), model.mjcf.resolve()):
-            raise UserError(f"--out {self.out} is what MODEL is made of; give another name")
-        done = export_mjcf(model, self.out)
-        for line in done.unsaid:
-            say(f"not in MJCF: {line}")
-        say(f"MJCF: {done.path}")
+            model = load_model(self.model, load_catalogue(self.effects))
+            if self.out.resolve() in (model.path.resolve(), model.mjcf.resolve()):
+                raise UserError(f"--out {self.out} is what MODEL is made of; give another name")
+            done = export_mjcf(model, self.out)
+            for line in done.unsaid:
+                say(f"not in MJCF: {line}")
+            say(f"MJCF: {done.path}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,10 +112,10 @@ class Convert:
         check_files([self.map], "--map")
         if self.out.resolve() == self.log.resolve():
             raise UserError(f"--out {self.out} is LOG itself; give another name")
-        check_out(self.out, ".csv", self.force)
-        from garat_jax.diagnosis.convert_logs import convert_log
+        with writing(self.out, ".csv", self.force):
+            from garat_jax.diagnosis.convert_logs import convert_log
 
-        say(convert_log(self.log, self.map, self.out))
+            say(convert_log(self.log, self.map, self.out))
 
 
 @dataclasses.dataclass(frozen=True)

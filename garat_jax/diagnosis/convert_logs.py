@@ -1,6 +1,6 @@
 """The command `garat convert`: a log of another kind becomes a recording, as a map file says."""
 
-import re
+import functools
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,14 @@ from garat_jax.diagnosis.tables import (
     Table,
     check_samples,
     check_wanted,
+    columns_of_arrays,
     read_mat,
-    read_npz,
     read_table,
 )
 from garat_jax.errors import UserError
 
-TABLES = (".csv", ".parquet")
+TABLES = (".csv", ".parquet", ".npz")
 KINDS = "a bag (folder, .bag, .mcap, .db3), .csv, .parquet, .npz or .mat"
-_ARRAY = re.compile(r"(?P<name>[^\[\]]+)(\[(?P<column>\d+)\])?")
 
 
 def convert_log(log: Path, map_file: Path, out: Path) -> str:
@@ -52,8 +51,9 @@ def convert_log(log: Path, map_file: Path, out: Path) -> str:
         columns = _from_bag(log, column_map)
     elif suffix in TABLES:
         columns = column_map.apply(read_table(log, column_map.sources).columns)
-    elif suffix in (".npz", ".mat"):
-        columns = _from_arrays(log, column_map)
+    elif suffix == ".mat":
+        table = Table(log, columns_of_arrays(log, column_map.sources, functools.partial(_mat, log)))
+        columns = column_map.apply(table.columns)
     else:
         raise UserError(f"{log}: unknown kind of log; expected {KINDS}")
     if "time" not in columns:
@@ -96,44 +96,6 @@ def _at(series: Series, stamps: np.ndarray, held: bool) -> np.ndarray:
     if held:
         return series.values[np.searchsorted(series.time, stamps, side="right") - 1]
     return np.interp(stamps, series.time, series.values)
-
-
-def _from_arrays(log: Path, column_map: ColumnMap) -> dict[str, np.ndarray]:
-    """Read NPZ and MAT files, whose arrays may have several columns and may be nested."""
-    places = {source: _place(source) for source in column_map.sources}
-    names = [name for name, _ in places.values()]
-    arrays = read_npz(log, names) if log.suffix.lower() == ".npz" else _mat(log, names)
-    raw = {
-        source: _one_column(log, arrays[name], source, column)
-        for source, (name, column) in places.items()
-    }
-    lengths = {name: len(values) for name, values in raw.items()}
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise UserError(f"{log}: the arrays are not equally long: {listed}")
-    return column_map.apply(raw)
-
-
-def _place(source: str) -> tuple[str, str | None]:
-    """Split `NAME[COLUMN]`; anything else is a name."""
-    match = _ARRAY.fullmatch(source)
-    return (match["name"], match["column"]) if match else (source, None)
-
-
-def _one_column(log: Path, array: np.ndarray, source: str, column: str | None) -> np.ndarray:
-    array = np.atleast_1d(np.squeeze(array))
-    if array.ndim == 2 and column is not None:
-        array = array if array.shape[0] >= array.shape[1] else array.T  # samples come first
-        if int(column) >= array.shape[1]:
-            raise UserError(f"{log}: {source} is not there; it has {array.shape[1]} columns")
-        return array[:, int(column)]
-    if array.ndim != 1:
-        raise UserError(
-            f"{log}: {source} has shape {array.shape}; name one column, such as {source}[0]"
-        )
-    if column is not None:
-        raise UserError(f"{log}: {source}: the array has one column only; leave [{column}] out")
-    return array
 
 
 def _mat(log: Path, names: Collection[str]) -> dict[str, np.ndarray]:

@@ -20,7 +20,7 @@ from garat_jax.diagnosis.continuous import (
     wrapped_joints,
 )
 from garat_jax.diagnosis.filters import white_noise
-from garat_jax.diagnosis.maps import ColumnMap
+from garat_jax.diagnosis.maps import ColumnMap, read_map
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.oddities import oddities
 from garat_jax.diagnosis.tables import FEWEST_SAMPLES, Table, check_samples, read_table
@@ -73,14 +73,15 @@ class Recording:
         cls,
         path: str | Path,
         model: Model | mujoco.MjModel,
-        column_map: ColumnMap | None = None,
+        column_map: ColumnMap | str | Path | None = None,
     ) -> "Recording":
         """Read and check a recording of a model.
 
         Args:
             path: CSV, Parquet or NPZ file.
             model: The model, which names the columns.
-            column_map: How the file names its columns, and in which units; see `maps.read_map`.
+            column_map: How the file names its columns, and in which units: a map file, or what
+                `read_map` made of one.
 
         Raises:
             UserError: The file cannot be read or does not fit the model; one line says where and
@@ -88,6 +89,8 @@ class Recording:
         """
         if isinstance(model, Model):
             model = native_model(model.compile(engine="mujoco"))
+        if isinstance(column_map, str | Path):
+            column_map = read_map(column_map)
         table = _read(path, model, column_map)
         velocity_measured = _check_columns(table, model)
         check_samples(table)

@@ -120,10 +120,16 @@ def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
             entry points; `load_catalogue` adds a user's own.
 
     Raises:
-        UserError: The file cannot be read, or the card names something that does not exist.
+        UserError: The file cannot be read, the card names something that does not exist, or the
+            catalogue is none.
     """
     path = Path(path)
     catalogue = load_catalogue() if catalogue is None else catalogue
+    if not isinstance(catalogue, Mapping):
+        raise UserError(
+            f"catalogue is {catalogue!r}; expected effects by kind: load_catalogue([FILE]), or "
+            "{kind: CATALOGUE[kind]} for a few"
+        )
     suffix = path.suffix.lower()
     if suffix not in (".xml", ".toml"):
         raise UserError(f"{path}: expected an MJCF file (.xml) or a model card (.toml)")

@@ -1,13 +1,15 @@
 """Read a file of columns: CSV, Parquet or NPZ, as arrays of numbers. Nothing is ever unpickled.
 
-The arrays of other NPZ files, and the variables of MAT files, are read here too.
+The variables of MAT files are read here too.
 """
 
 import csv
+import functools
+import re
 import warnings
 import zipfile
 import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ ROWS_NAMED = 5
 """How many bad rows a message names."""
 SEPARATORS = (",", ";", "\t")
 """Of a foreign CSV file: the one that its first line has most of."""
+_ARRAY = re.compile(r"(?P<name>[^\[\]]+)(\[(?P<column>\d+)\])?")
 
 
 class Table:
@@ -68,7 +71,8 @@ def read_table(path: str | Path, wanted: Collection[str] | None = None) -> Table
     Args:
         path: The file.
         wanted: Leave out all other columns of a foreign file, whose separator may then be a
-            semicolon or a tab too; None reads every column.
+            semicolon or a tab too, and its arrays of any shape, as in `columns_of_arrays`; None
+            reads every column.
 
     Raises:
         UserError: The file is missing, empty, of another kind, damaged, or holds anything but
@@ -208,25 +212,65 @@ def check_wanted(
 
 
 def _read_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
-    columns = read_npz(path, wanted)
+    if wanted is not None:
+        return columns_of_arrays(path, wanted, functools.partial(_arrays_in_npz, path))
+    columns = _arrays_in_npz(path, None)
     for name, column in columns.items():
         if column.ndim != 1:
             raise UserError(
-                f"{path}: array {name!r} has shape {column.shape}; expected one number a sample"
+                f"{path}: array {name!r} has shape {column.shape}; expected one number a sample, "
+                f"or a map file that names one of its columns {name}[0]"
             )
     return columns
 
 
-def read_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
-    """Read the arrays of an NPZ archive, of any shape.
+def columns_of_arrays(
+    path: Path,
+    wanted: Collection[str],
+    read: Callable[[Collection[str]], Mapping[str, np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """Return columns of arrays of any shape, each named `ARRAY` or `ARRAY[COLUMN]`.
 
     Args:
-        path: The file.
-        wanted: Leave all other arrays unread; None reads every array.
+        path: The file that the arrays are in.
+        wanted: The columns.
+        read: Returns the arrays of the file, those of some names at least.
 
     Raises:
-        UserError: The file is damaged, or lacks an array, or one holds anything but numbers.
+        UserError: An array is not there or has no such column.
     """
+    places = {source: _place(source) for source in wanted}
+    arrays = read([name for name, _ in places.values()])
+    return {
+        source: _one_column(path, arrays[name], source, column)
+        for source, (name, column) in places.items()
+    }
+
+
+def _place(source: str) -> tuple[str, str | None]:
+    """Split `NAME[COLUMN]`; anything else is a name."""
+    match = _ARRAY.fullmatch(source)
+    return (match["name"], match["column"]) if match else (source, None)
+
+
+def _one_column(path: Path, array: np.ndarray, source: str, column: str | None) -> np.ndarray:
+    array = np.atleast_1d(np.squeeze(array))
+    if array.ndim == 2 and column is not None:
+        array = array if array.shape[0] >= array.shape[1] else array.T  # samples come first
+        if int(column) >= array.shape[1]:
+            raise UserError(f"{path}: {source} is not there; it has {array.shape[1]} columns")
+        return array[:, int(column)]
+    if array.ndim != 1:
+        raise UserError(
+            f"{path}: {source} has shape {array.shape}; name one column, such as {source}[0]"
+        )
+    if column is not None:
+        raise UserError(f"{path}: {source}: the array has one column only; leave [{column}] out")
+    return array
+
+
+def _arrays_in_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
+    """Read arrays of any shape, all or those that are wanted."""
     if not zipfile.is_zipfile(path):
         raise UserError(f"{path}: not an NPZ archive; write it with numpy.savez")
     try:

@@ -80,11 +80,9 @@ def unit_of(column: str, name: str, expected: str | None = None) -> Unit:
     Raises:
         UserError: There is no such unit, or the column cannot have it.
     """
-    unit = choose(f"unit of {column}", name, UNITS)
-    allowed = ALLOWED.get(column.partition(".")[0])
-    if expected is not None:
-        allowed = (expected,)
-    if allowed and unit.si not in allowed:
-        fitting = [known for known, u in UNITS.items() if u.si in allowed]
+    kind = column.partition(".")[0]
+    allowed = (expected,) if expected is not None else ALLOWED.get(kind)
+    fitting = {known: u for known, u in UNITS.items() if not allowed or u.si in allowed}
+    if name in UNITS and name not in fitting:
         raise UserError(f"{column} cannot be in {name!r}; expected one of {', '.join(fitting)}")
-    return unit
+    return choose(f"unit of {column}", name, fitting)

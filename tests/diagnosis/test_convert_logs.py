@@ -240,7 +240,7 @@ def test_without_rosbags_the_extra_is_named(tmp_path, capsys, monkeypatch):
         (OF_ARRAYS.replace("state[0]", "state"), 'time = "t"', "name one column, such as state[0]"),
         (OF_ARRAYS.replace("state[0]", "state[7]"), 'time = "t"', "it has 2 columns"),
         (OF_ARRAYS.replace('"u"', '"u[0]"'), 'time = "t"', "has one column only; leave [0] out"),
-        (OF_ARRAYS.replace('"u"', '"short"'), 'time = "t"', "not equally long"),
+        (OF_ARRAYS.replace('"u"', '"short"'), 'time = "t"', "expected one value a sample in each"),
         (OF_ARRAYS, "", 'the samples have no time; add time = "NAME"'),
     ],
 )

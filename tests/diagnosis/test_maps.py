@@ -64,7 +64,18 @@ def test_parquet_takes_a_map_too(tmp_path):
 def test_npz_takes_a_map_too(tmp_path):
     path = tmp_path / "log.npz"
     np.savez(path, **{name: v for name, v in FOREIGN.items() if name != "mode"}, extra=np.eye(2))
-    assert len(Recording.read(path, MODEL, read_map(write(tmp_path))).time) == 50
+    assert len(Recording.read(path, MODEL, write(tmp_path)).time) == 50
+
+
+def test_a_map_names_columns_of_arrays_in_npz(tmp_path):
+    path = tmp_path / "log.npz"
+    state = np.stack([FOREIGN["angle"], FOREIGN["speed"]], axis=1)
+    np.savez(path, t=TIME, torque=FOREIGN["torque"], state=state)
+    text = MAP.replace('"angle"', '"state[0]"').replace('"speed"', '"state[1]"')
+    recording = Recording.read(path, MODEL, str(write(tmp_path, text)))
+    np.testing.assert_allclose(recording.qvel[:, 0], -np.pi, rtol=1e-12)
+    with pytest.raises(UserError, match=r"or a map file that names one of its columns state\[0\]"):
+        Recording.read(path, MODEL)
 
 
 def test_scale_counts_before_the_offset(tmp_path):
@@ -95,9 +106,10 @@ def test_units_are_what_they_say():
         ('"qpos.hinge"', "qpos.hinge", "ctrl.ACTUATOR or torque.JOINT, in quotes"),
         ('"qpos.hinge"', '"angle.hinge"', "expected time, qpos.JOINT, qvel.JOINT"),
         ('"deg"', '"degs"', "unknown unit of qpos.hinge 'degs'; did you mean deg"),
-        ('"deg"', "2", "unknown unit of qpos.hinge '2'; known: %, 1, A, N, "),
+        ('"deg"', "2", "unit of qpos.hinge '2'; known: %, 1, cm, deg, in, m, mm, mrad, "),
         ('"deg"', '"rpm"', "qpos.hinge cannot be in 'rpm'; expected one of "),
         ('"deg"', '"mm"', "qpos.hinge cannot be in 'mm'; expected one of rad, mrad, deg, turn"),
+        ('"ms"', '"hour"', "unknown unit of time 'hour'; known: min, ms, ns, s, us"),
         ('"ms"', '"deg"', "time cannot be in 'deg'; expected one of s, ms"),
         ("sign = -1, offset", "sign = -2, offset", "qpos.hinge sign = -2; expected 1 or -1"),
         ("sign = -1, offset", "scale = 0, offset", "qpos.hinge scale = 0; expected another number"),

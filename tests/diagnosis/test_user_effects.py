@@ -217,6 +217,11 @@ def test_other_files_are_refused(tmp_path):
         load_catalogue([other])
 
 
+def test_a_list_of_kinds_is_no_catalogue(mine):
+    with pytest.raises(UserError, match=r"catalogue is \['my_spring'\]; expected effects by kind"):
+        load_model(mine.parent / "pendulum.xml", ["my_spring"])  # pyright: ignore
+
+
 def test_entry_points_are_loaded_and_a_bad_one_is_named(mine, monkeypatch):
     (cls,) = (c for k, c in load_catalogue([mine]).items() if k == "my_spring")
     group = "garat_jax.effects"
