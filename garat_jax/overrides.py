@@ -8,9 +8,16 @@ import mujoco
 import numpy as np
 
 from garat_jax.effects.elements import OBJECT_TYPES
-from garat_jax.errors import UserError, unknown_name
+from garat_jax.errors import UserError, choose, unknown_name
 
 NUMBERS = (int, float, np.number, list, tuple, np.ndarray)
+OPTION_WORDS = {
+    "integrator": mujoco.mjtIntegrator,
+    "solver": mujoco.mjtSolver,
+    "cone": mujoco.mjtCone,
+    "jacobian": mujoco.mjtJacobian,
+}
+"""Options that MJCF gives as a word and MuJoCo as a number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +29,8 @@ class Override:
         name: The element's name; empty for `option`.
         field: The field of MuJoCo's spec. A body's `mass` scales its inertia with it, whether it
             is given explicitly or comes from the body's geoms.
-        value: The new value.
+        value: The new value; of an option that is a word in MJCF, as `integrator`, the word or
+            MuJoCo's number.
     """
 
     element: str
@@ -40,16 +48,20 @@ class Override:
         known = [name for name in dir(target) if _is_field(target, name)]
         if self.field not in known:
             raise unknown_name(f"{self.element} field", self.field, known)
-        current = getattr(target, self.field)
+        current, value = getattr(target, self.field), self.value
+        if self.element == "option" and self.field in OPTION_WORDS and isinstance(value, str):
+            members = OPTION_WORDS[self.field].__members__.items()
+            words = {name.partition("_")[2].lower(): int(member) for name, member in members}
+            value = choose(f"option {self.field}", value.lower(), words)
         try:
-            if not _is_finite(self.value):
+            if not _is_finite(value):
                 raise ValueError("not finite")
             if self.element == "body" and self.field == "mass":
-                _scale_mass(spec, target, float(self.value))
-            elif np.ndim(current) == 1 and np.ndim(self.value) == 0:
-                current[0] = self.value
+                _scale_mass(spec, target, float(value))
+            elif np.ndim(current) == 1 and np.ndim(value) == 0:
+                current[0] = value
             else:
-                setattr(target, self.field, self.value)
+                setattr(target, self.field, value)
         except UserError:
             raise
         except (TypeError, ValueError) as error:

@@ -1,5 +1,6 @@
 """Changes of a model before it is compiled: what they reach, and each refusal."""
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -20,6 +21,14 @@ def test_a_mass_override_scales_the_inertia_with_it():
     np.testing.assert_allclose(after.body("pole").inertia, 3 * before.body("pole").inertia)
 
 
+def test_options_that_are_words_in_mjcf_take_the_word_or_the_number():
+    for value in ("RK4", 1):
+        model = compiled(Override("option", "", "integrator", value))
+        assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    cone = compiled(Override("option", "", "cone", "elliptic")).opt.cone
+    assert cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -36,8 +45,12 @@ def test_a_mass_override_scales_the_inertia_with_it():
             "expected a finite number or 3 of them",
         ),
         (
-            Override("option", "", "integrator", "foo"),
-            "integrator = 'foo'; expected a whole number, as 0 is",
+            Override("option", "", "integrator", "rk5"),
+            "unknown option integrator 'rk5'; did you mean rk4",
+        ),
+        (
+            Override("option", "", "iterations", "many"),
+            "iterations = 'many'; expected a whole number, as 100 is",
         ),
         (
             Override("joint", "hinge", "range", [0.0, float("inf")]),
