@@ -1,18 +1,20 @@
 """Turns a command line into a command, and what goes wrong into one line. No JAX."""
 
 import contextlib
+import dataclasses
 import io
 import itertools
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 import tyro
 
 from garat_jax.errors import UserError, unknown_name
 
 PROGRAM = "garat"
+HELP = ("--help", "-h")
 _BOX_DRAWING = re.compile(r"[\u2500-\u257f]+")
 
 
@@ -39,9 +41,10 @@ def parse(arguments: Sequence[str], commands: Mapping[str, type], description: s
     Raises:
         UserError: The arguments are wrong; for a misspelt command or option, with the nearest.
     """
-    if not {"--help", "-h"} & set(arguments):
+    if not arguments or arguments[0] not in HELP:
         _check_spelling(arguments, commands)
-        arguments = [arguments[0], *_gathered(arguments[1:], _options(commands[arguments[0]]))]
+    if not set(HELP) & set(arguments):
+        arguments = [arguments[0], *_gathered(arguments[1:], commands[arguments[0]])]
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
@@ -88,7 +91,8 @@ def _check_spelling(arguments: Sequence[str], commands: Mapping[str, type]) -> N
         raise unknown_name("command", name, commands)
     known = [*_options(commands[name]), "--help"]
     for argument in rest:
-        if argument.startswith("--") and _option_in(argument) not in known:
+        is_option = argument.startswith("--") and argument not in HELP
+        if is_option and _option_in(argument) not in known[:-1]:
             option = argument.partition("=")[0]
             raise unknown_name(f"option of {PROGRAM} {name}", option, known)
 
@@ -98,10 +102,14 @@ def _options(command: type) -> dict[str, Any]:
     hints = get_type_hints(command)
     marks = get_type_hints(command, include_extras=True)
     return {
-        f"--{name.replace('_', '-')}": hint
+        _option_named(name): hint
         for name, hint in hints.items()
         if tyro.conf.Positional not in getattr(marks[name], "__metadata__", ())
     }
+
+
+def _option_named(field: str) -> str:
+    return f"--{field.replace('_', '-')}"
 
 
 def _option_in(argument: str) -> str:
@@ -109,44 +117,66 @@ def _option_in(argument: str) -> str:
     return argument.partition("=")[0].replace("_", "-")
 
 
-def _gathered(words: Sequence[str], options: Mapping[str, Any]) -> list[str]:
-    """Return the words with what each list option was given, here and there, in one place.
+def _gathered(words: Sequence[str], command: type) -> list[str]:
+    """Return the words with the positionals first, and each option once with all its values.
 
-    A list option takes the words after it up to the next option.
+    An option that takes several values takes all words up to the next option.
 
     Raises:
-        UserError: An option that takes one value is given twice, a list option without any, or an
-            option that takes a number is given something else.
+        UserError: An option that takes one value is given twice, one has fewer values than it
+            takes, one that takes a number is given something else, or a positional is missing.
     """
-    lists = {name: list[str]() for name, hint in options.items() if _is_list(hint)}
-    others = list[str]()
+    options = _options(command)
+    positionals, given = list[str](), dict[str, list[str]]()
     left = list(words)
     while left:
         word = left.pop(0)
-        name, equals, value = _option_in(word), "=" in word, word.partition("=")[2]
         if not word.startswith("--"):
-            others.append(word)
-        elif name in lists:
-            values = [value] if equals else list(itertools.takewhile(_is_value, left))
-            if not values:
-                raise UserError(f"{name}: expected one value or more after it")
-            left = left if equals else left[len(values) :]
-            lists[name] += values
-        elif options[name] is not bool and name in map(_option_in, others):
+            positionals.append(word)
+            continue
+        name, (_, equals, value) = _option_in(word), word.partition("=")
+        count = _num_values(options[name])
+        if count is not None and count and name in given:
             raise UserError(f"{name} is given twice; expected it once")
-        else:
-            for given in [value] if equals else filter(_is_value, left[:1]):
-                _check_number(name, given, options[name])
-            others.append(word)
-    return [*others, *itertools.chain(*([n, *values] for n, values in lists.items() if values))]
+        following = list(itertools.takewhile(lambda word: not word.startswith("--"), left))
+        values = ([value] if equals else following)[:count]
+        if not equals:
+            del left[: len(values)]
+        is_value = all(v and not v.startswith("--") for v in values)
+        enough = not equals if count == 0 else len(values) >= (count or 1)
+        if not enough or not is_value:
+            raise UserError(f"{name}: expected {_wanted(count)} after it")
+        for each in values:
+            _check_number(name, each, options[name])
+        given.setdefault(name, []).extend(values)
+    _check_positionals(positionals, command, any(len(v) > 1 for v in given.values()))
+    return [*positionals, *itertools.chain(*([name, *values] for name, values in given.items()))]
 
 
-def _is_list(hint: Any) -> bool:
-    return get_args(hint)[1:] == (...,)
+def _check_positionals(words: Sequence[str], command: type, have_taken: bool) -> None:
+    """Refuse too few of them; say where they may be if options have taken several words."""
+    fields = dataclasses.fields(command)
+    needed = [f.name for f in fields if f.default is dataclasses.MISSING]
+    positionals = [name for name in needed if _option_named(name) not in _options(command)]
+    if missing := [name.upper() for name in positionals[len(words) :]]:
+        hint = (
+            "; an option that takes several values takes all words up to the next option: "
+            f"put {missing[0]} before it"
+        )
+        raise UserError(f"missing: {', '.join(missing)}{hint if have_taken else ''}")
 
 
-def _is_value(word: str) -> bool:
-    return not word.startswith("--")
+def _num_values(hint: Any) -> int | None:
+    """Return how many words an option takes; None for all that follow."""
+    if hint is bool:
+        return 0
+    if get_origin(hint) is tuple:
+        return None if ... in get_args(hint) else len(get_args(hint))
+    return 1
+
+
+def _wanted(count: int | None) -> str:
+    return {None: "one value or more", 0: "no value", 1: "a value"}.get(count, f"{count} values")
 
 
 def _check_number(name: str, value: str, hint: Any) -> None:

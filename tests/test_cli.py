@@ -68,12 +68,12 @@ def test_version():
         (["--verison"], ["unknown option '--verison'", "--version"]),
         (["transfer", "x", "--sedes", "2"], ["'--sedes'", "did you mean --seeds"]),
         (["transfer", "x", "--sedes=2"], ["'--sedes'", "did you mean --seeds"]),
-        (["transfer"], ["Missing", "PAIR"]),
+        (["transfer"], ["missing: PAIR"]),
         (["transfer", "x", "y"], ["Unrecognized", "y"]),
         (["transfer", "x", "--seeds", "many"], ["--seeds 'many': expected a whole number"]),
         (["transfer", "x", "--seeds=1.5"], ["--seeds '1.5': expected a whole number"]),
         (["ground", "x", "y", "--interval", "abc"], ["--interval 'abc': expected a number"]),
-        (["transfer", "x", "--seeds"], ["Missing value", "--seeds"]),
+        (["transfer", "x", "--seeds"], ["--seeds: expected a value after it"]),
         (["transfer", "x", "--seeds", "0"], ["--seeds 0", "1 or more"]),
         (["transfer", "x", "--seeds", "2", "--seeds=3"], ["--seeds is given twice"]),
         (["compare", "x", "y", "--out", "a", "--out", "b"], ["--out is given twice"]),
@@ -84,8 +84,14 @@ def test_version():
         (["transfer", "x", "--process-id", "1"], ["--process-id", "with --distributed"]),
         (["transfer", "x", "--device", "abacus"], ["'abacus'", "'auto', 'cpu', 'gpu', 'tpu'"]),
         (["compare", "no.xml", "no.csv"], ["MODEL", "there is no file no.xml"]),
-        (["compare", __file__], ["DATA", "one file or more"]),
-        (["compare", "--also", __file__, __file__], ["DATA", "files that belong to none first"]),
+        (["compare", __file__], ["missing: DATA"]),
+        (["compare", "--also", "a", "b", "c"], ["missing: MODEL, DATA", "put MODEL before it"]),
+        (["compare", "x", "y", "--also=--force"], ["--also: expected one value or more"]),
+        (["compare", "x", "y", "--out", "--also=a", "z"], ["--out: expected a value after it"]),
+        (["compare", "x", "y", "--force=yes"], ["--force: expected no value after it"]),
+        (["compare", "x", "--help=x"], ["unknown option of garat compare '--help'"]),
+        (["compare", "--alos", "--help"], ["did you mean --also"]),
+        (["plan", "x", "--separate", "a"], ["--separate: expected 2 values after it"]),
         (
             ["compare", __file__, __file__, "--also", "no.xml", "--also", __file__],
             ["--also: there is no file no.xml"],
@@ -208,7 +214,7 @@ def test_an_output_that_fails_leaves_no_folders_and_is_tried_first(tmp_path):
         raise UserError("no luck")
     assert out.is_file()
     under_a_file = out / "new" / "x.csv"
-    with pytest.raises(UserError, match="cannot write to"), writing(under_a_file, ".csv", False):
+    with pytest.raises(UserError, match="cannot be written"), writing(under_a_file, ".csv", False):
         raise AssertionError
 
 

@@ -104,10 +104,7 @@ def _check_outside(command: Any, out: Path) -> None:
 def check_files(paths: Sequence[Path], what: str) -> None:
     """Refuse an empty list of files and files that are not there."""
     if not paths:
-        raise UserError(
-            f"{what}: expected one file or more; an option that takes several words takes all up "
-            "to the next option, so put files that belong to none first"
-        )
+        raise UserError(f"{what}: expected one file or more")
     for path in paths:
         if path.is_dir():
             raise UserError(f"{what}: {path} is a folder; name the files in it")
@@ -140,9 +137,10 @@ def writing(path: Path, suffix: str, force: bool) -> Iterator[None]:
     try:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=path.parent).close()
+            with path.open("r+b") if path.exists() else tempfile.TemporaryFile(dir=path.parent):
+                pass
         except OSError as error:
-            raise UserError(f"cannot write to {path.parent}: {error.strerror}") from error
+            raise UserError(f"--out {path} cannot be written: {error}") from error
         yield
     except BaseException:
         for folder in new:

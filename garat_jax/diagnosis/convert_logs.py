@@ -1,7 +1,6 @@
 """The command `garat convert`: a log of another kind becomes a recording, as a map file says."""
 
-import functools
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from garat_jax.diagnosis.maps import ColumnMap, read_map
 from garat_jax.diagnosis.tables import (
     Table,
     check_samples,
-    check_wanted,
     columns_of_arrays,
     read_mat,
     read_table,
@@ -52,8 +50,8 @@ def convert_log(log: Path, map_file: Path, out: Path) -> str:
     elif suffix in TABLES:
         columns = column_map.apply(read_table(log, column_map.sources).columns)
     elif suffix == ".mat":
-        table = Table(log, columns_of_arrays(log, column_map.sources, functools.partial(_mat, log)))
-        columns = column_map.apply(table.columns)
+        columns = columns_of_arrays(log, column_map.sources, _mat(log))
+        columns = column_map.apply(Table(log, columns).columns)
     else:
         raise UserError(f"{log}: unknown kind of log; expected {KINDS}")
     if "time" not in columns:
@@ -98,15 +96,13 @@ def _at(series: Series, stamps: np.ndarray, held: bool) -> np.ndarray:
     return np.interp(stamps, series.time, series.values)
 
 
-def _mat(log: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read the arrays of numbers in a MAT file, some of which have to be there.
+def _mat(log: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of numbers in a MAT file.
 
     Fields of a structure are named `a.b`; cells, and the elements of an array of structures, `a.0`,
     `a.1` and so on. One cell alone is named as if it were none.
     """
-    arrays = _flatten(read_mat(log, squeeze=True))
-    check_wanted(log, names, arrays, "array")
-    return arrays
+    return _flatten(read_mat(log, squeeze=True))
 
 
 def _flatten(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:

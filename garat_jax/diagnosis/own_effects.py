@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import inspect
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -15,13 +16,13 @@ from garat_jax.dynamics import Dynamics, PhysicsState, compile, initial_state, s
 from garat_jax.effects import CATALOGUE, Effect
 from garat_jax.effects.base import ModelView
 from garat_jax.effects.catalogue import line_in
-from garat_jax.errors import UserError, unknown_name
+from garat_jax.errors import UserError, nearest
 from garat_jax.overrides import Override
 
 CLOSE = 1e-5
-"""By how much a law without effect may change a number, or a part of it."""
-TRIALS = 8
-"""States and commands that a law without effect is tried at."""
+"""By which part of the largest of its kind a law without effect may change a number."""
+TRIALS, STEPS = 8, 3
+"""States that a law without effect is tried at, and commands in a row at each."""
 
 
 def is_own(effect: Effect) -> bool:
@@ -55,6 +56,8 @@ def try_own(
 def check_identity(spec: mujoco.MjSpec, cls: type[Effect], target: str) -> None:
     """Refuse a law that changes something where its parameters mean "no effect".
 
+    What `prepare` does, and to what it adds, is left to it.
+
     Raises:
         UserError: It changes a field of the model, a command or a sensor, or adds a force.
     """
@@ -63,7 +66,7 @@ def check_identity(spec: mujoco.MjSpec, cls: type[Effect], target: str) -> None:
     (effect,), host = alone.effects, alone.host.model
     rng = np.random.default_rng(0)
     low, high = _command_range(host)
-    ctrl = rng.uniform(low, high, (TRIALS, host.nu))
+    ctrl = rng.uniform(low, high, (TRIALS, STEPS, host.nu))
     qvel = rng.normal(size=(TRIALS, host.nv))
     qpos = np.repeat(host.qpos0[None], TRIALS, axis=0)
     for place, velocity in zip(qpos, qvel, strict=True):
@@ -74,7 +77,8 @@ def check_identity(spec: mujoco.MjSpec, cls: type[Effect], target: str) -> None:
     for method, changes in done.items():
         for what, pair in changes.items():
             after, before = (np.asarray(x, float) for x in pair)
-            same = np.isclose(after, before, rtol=CLOSE, atol=CLOSE, equal_nan=True)
+            largest = np.max(np.abs(before), initial=0.0) or 1.0
+            same = np.isclose(after, before, rtol=CLOSE, atol=CLOSE * largest, equal_nan=True)
             if not same.all():
                 i = tuple(np.argwhere(~same)[0])
                 raise _mistake(
@@ -86,22 +90,28 @@ def check_identity(spec: mujoco.MjSpec, cls: type[Effect], target: str) -> None:
 
 
 def _done_by(dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array):
-    """Return what each method of the only effect makes of what: (after, before) by method, name."""
+    """Return what each method of the only effect makes of what: (after, before) by method, name.
+
+    Commands are [STEPS, nu]: memories fill in the first of them.
+    """
     (effect,), host = dynamics.effects, dynamics.host.model
     bare, model = view(dynamics.replace(effects=())), view(dynamics)
     state = initial_state(dynamics, qpos, qvel)
-    seen = state if effect.reads_state else None
-    tuned = effect.tune(model, seen, ctrl) if effect.tunes else {}
-    sent, force, _ = effect.apply(model.replace(tuned), seen, ctrl, state.memory[0])
+    seen, memory = state if effect.reads_state else None, state.memory[0]
+    tuned, sent, force = {}, ctrl[-1], None
+    for command in ctrl:
+        tuned = effect.tune(model, seen, command)
+        sent, force, memory = effect.apply(model.replace(tuned), seen, command, memory)
+    memory = effect.note(host, state, dynamics.timestep, state.memory[0])
+    sensed = effect.sense(host, state, memory)
     nothing = jnp.zeros(host.nv)
-    sensed = effect.sense(host, state, state.memory[0])
     # What `prepare` adds to the model it may also set.
     fields = {} if type(effect).prepare is not Effect.prepare else effect.fields(bare)
     return {
         "fields": {name: (value, bare[name]) for name, value in fields.items()},
         "tune": {name: (value, model[name]) for name, value in tuned.items()},
         "apply": {
-            "the command": (sent, ctrl),
+            "the command": (sent, ctrl[-1]),
             "the force": (nothing if force is None else force, nothing),
         },
         "sense": {"qpos": (sensed.qpos, state.qpos), "qvel": (sensed.qvel, state.qvel)},
@@ -116,10 +126,9 @@ def _check_shapes(dynamics: Dynamics) -> None:
     fields = effect.fields(bare)
     _check_fields(effect, "fields", bare, fields)
     model, state = bare.replace(fields), _rest(dynamics)
-    ctrl, memory = jnp.zeros(host.nu), state.memory[0]
+    ctrl, memory = jnp.zeros(host.nu), effect.init(host)
     seen = state if effect.reads_state else None
-    if effect.tunes:
-        _check_fields(effect, "tune", model, effect.tune(model, seen, ctrl))
+    _check_fields(effect, "tune", model, effect.tune(model, seen, ctrl))
     returned = effect.apply(model, seen, ctrl, memory)
     if not isinstance(returned, tuple) or len(returned) != 3:
         what = "apply returns something else than (command, force or None, memory)"
@@ -128,33 +137,53 @@ def _check_shapes(dynamics: Dynamics) -> None:
     _check_shape(effect, "apply", "the command", sent, (host.nu,))
     if force is not None:
         _check_shape(effect, "apply", "the force", force, (host.nv,))
-    shapes = [jax.tree.map(jnp.shape, each) for each in (after, memory)]
-    if shapes[0] != shapes[1]:
-        what = f"apply returns a memory of shape {shapes[0]}; expected {shapes[1]}, as of init"
-        raise _mistake(effect, "apply", what)
-    sensed = effect.sense(host, state, memory)
+    _check_memory(effect, "apply", after, memory)
+    _check_memory(effect, "note", effect.note(host, state, 0.0, memory), memory)
+    sensed = effect.sense(host, state, state.memory[0])
+    if not isinstance(sensed, PhysicsState):
+        raise _mistake(effect, "sense", "sense returns something else than the state")
     _check_shape(effect, "sense", "qpos", sensed.qpos, (host.nq,))
     _check_shape(effect, "sense", "qvel", sensed.qvel, (host.nv,))
 
 
-def _check_fields(
-    effect: Effect, method: str, model: ModelView, fields: Mapping[str, jax.Array]
-) -> None:
+def _check_fields(effect: Effect, method: str, model: ModelView, fields: Any) -> None:
+    if not isinstance(fields, Mapping):
+        raise _mistake(effect, method, f"{method} returns something else than a dict of fields")
+    known = _field_names(model.host)
     for name, value in fields.items():
-        try:
-            shape = model[name].shape
-        except (AttributeError, TypeError):
-            known = [n for n in dir(mujoco.MjModel) if not n.startswith("_")]
-            raise _mistake(
-                effect, method, f"{method} returns an {unknown_name('field', name, known)}"
-            ) from None
-        _check_shape(effect, method, name, value, shape)
+        if name not in known:
+            close = " or ".join(nearest(str(name), known))
+            advice = f"did you mean {close}?" if close else "mujoco.MjModel has those that are"
+            what = f"{method} returns {name!r}, which is no field of MuJoCo's model; {advice}"
+            raise _mistake(effect, method, what)
+        _check_shape(effect, method, name, value, model[name].shape)
+
+
+def _field_names(host: mujoco.MjModel) -> list[str]:
+    """List the native numbers of a model, those of its options as `opt.NAME`."""
+    arrays = [n for n in dir(host) if isinstance(getattr(host, n), np.ndarray)]
+    numbers = [n for n in dir(host.opt) if isinstance(getattr(host.opt, n), float | np.ndarray)]
+    return [*arrays, *(f"opt.{name}" for name in numbers)]
 
 
 def _check_shape(effect: Effect, method: str, what: str, value: Any, shape: tuple) -> None:
-    if jnp.shape(value) != shape:
-        returned = f"{method} returns {what} of shape {jnp.shape(value)}; expected {shape}"
+    if not isinstance(value, jax.Array | np.ndarray):
+        returned = f"{method} returns {type(value).__name__} for {what}; expected an array"
+        raise _mistake(effect, method, f"{returned} of shape {shape}")
+    if value.shape != shape:
+        returned = f"{method} returns {what} of shape {value.shape}; expected {shape}"
         raise _mistake(effect, method, returned)
+
+
+def _check_memory(effect: Effect, method: str, after: Any, before: Any) -> None:
+    """Refuse another memory than that of `init`: JAX carries one shape and type along."""
+    said = []
+    for memory in (after, before):
+        kinds = jax.tree.map(lambda x: f"{jnp.result_type(x)}{jnp.shape(x)}", memory)
+        said.append(f"{kinds} ({jax.tree.structure(memory)})")
+    if said[0] != said[1]:
+        what = f"{method} returns the memory {said[0]}; expected {said[1]}, as of init"
+        raise _mistake(effect, method, what)
 
 
 def _one_step(dynamics: Dynamics) -> PhysicsState:
@@ -187,9 +216,11 @@ def _named(effect: Effect) -> Iterator[None]:
 
 def _mistake(effect: Effect, method: str, what: str) -> UserError:
     """Return an error that names an effect and where one of its methods begins."""
+    where = _file_of(effect)
     code = getattr(inspect.unwrap(getattr(type(effect), method)), "__code__", None)
-    line = f" line {code.co_firstlineno}" if code else ""
-    return UserError(_told(effect, f"{_file_of(effect)}{line}", what))
+    if code and code.co_filename == os.path.abspath(where):  # not one that it inherits
+        where = f"{where} line {code.co_firstlineno}"
+    return UserError(_told(effect, where, what))
 
 
 def _told(effect: Effect, where: str, what: str) -> str:

@@ -4,12 +4,11 @@ The variables of MAT files are read here too.
 """
 
 import csv
-import functools
 import re
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -212,9 +211,12 @@ def check_wanted(
 
 
 def _read_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
-    if wanted is not None:
-        return columns_of_arrays(path, wanted, functools.partial(_arrays_in_npz, path))
-    columns = _arrays_in_npz(path, None)
+    if not zipfile.is_zipfile(path):
+        raise UserError(f"{path}: not an NPZ archive; write it with numpy.savez")
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        if wanted is not None:
+            return columns_of_arrays(path, wanted, archive)
+        columns = {name: _numbers_of(path, archive, name) for name in archive.files}
     for name, column in columns.items():
         if column.ndim != 1:
             raise UserError(
@@ -225,63 +227,53 @@ def _read_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarra
 
 
 def columns_of_arrays(
-    path: Path,
-    wanted: Collection[str],
-    read: Callable[[Collection[str]], Mapping[str, np.ndarray]],
+    path: Path, wanted: Collection[str], arrays: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Return columns of arrays of any shape, each named `ARRAY` or `ARRAY[COLUMN]`.
 
     Args:
         path: The file that the arrays are in.
         wanted: The columns.
-        read: Returns the arrays of the file, those of some names at least.
+        arrays: Its arrays by name.
 
     Raises:
-        UserError: An array is not there or has no such column.
+        UserError: An array is not there, has no such column, or holds anything but numbers.
     """
-    places = {source: _place(source) for source in wanted}
-    arrays = read([name for name, _ in places.values()])
+    places = {source: _place(source, arrays) for source in wanted}
+    check_wanted(path, [name for name, _ in places.values()], arrays, "array")
     return {
-        source: _one_column(path, arrays[name], source, column)
+        source: _one_column(path, _numbers_of(path, arrays, name), source, column)
         for source, (name, column) in places.items()
     }
 
 
-def _place(source: str) -> tuple[str, str | None]:
-    """Split `NAME[COLUMN]`; anything else is a name."""
+def _place(source: str, there: Collection[str]) -> tuple[str, str | None]:
+    """Split `NAME[COLUMN]`; anything else is a name, and what an array is named."""
     match = _ARRAY.fullmatch(source)
-    return (match["name"], match["column"]) if match else (source, None)
+    return (match["name"], match["column"]) if match and source not in there else (source, None)
 
 
 def _one_column(path: Path, array: np.ndarray, source: str, column: str | None) -> np.ndarray:
     array = np.atleast_1d(np.squeeze(array))
-    if array.ndim == 2 and column is not None:
-        array = array if array.shape[0] >= array.shape[1] else array.T  # samples come first
-        if int(column) >= array.shape[1]:
-            raise UserError(f"{path}: {source} is not there; it has {array.shape[1]} columns")
-        return array[:, int(column)]
-    if array.ndim != 1:
+    if array.ndim > 2:
+        raise UserError(
+            f"{path}: {source} is of an array of shape {array.shape}; expected one or two "
+            "dimensions, samples first"
+        )
+    if array.ndim == 1:
+        if column is not None:
+            raise UserError(
+                f"{path}: {source}: the array has one column only; leave [{column}] out"
+            )
+        return array
+    if column is None:
         raise UserError(
             f"{path}: {source} has shape {array.shape}; name one column, such as {source}[0]"
         )
-    if column is not None:
-        raise UserError(f"{path}: {source}: the array has one column only; leave [{column}] out")
-    return array
-
-
-def _arrays_in_npz(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
-    """Read arrays of any shape, all or those that are wanted."""
-    if not zipfile.is_zipfile(path):
-        raise UserError(f"{path}: not an NPZ archive; write it with numpy.savez")
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            check_wanted(path, wanted or (), archive.files, "array")
-            names = archive.files if wanted is None else dict.fromkeys(wanted)
-            return {name: _numbers_of(path, archive, name) for name in names}
-    except UserError:
-        raise
-    except DAMAGED as error:
-        raise damaged(path, "NPZ", error) from error
+    array = array if array.shape[0] >= array.shape[1] else array.T  # samples come first
+    if int(column) >= array.shape[1]:
+        raise UserError(f"{path}: {source} is not there; it has {array.shape[1]} columns")
+    return array[:, int(column)]
 
 
 def read_mat(path: Path, squeeze: bool) -> dict[str, Any]:
@@ -307,14 +299,14 @@ def read_mat(path: Path, squeeze: bool) -> dict[str, Any]:
     return {name: value for name, value in content.items() if not name.startswith("__")}
 
 
-def _numbers_of(path: Path, archive: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    """Return an array of an NPZ archive; what is pickled stays unread.
+def _numbers_of(path: Path, arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """Return an array of a file; what an NPZ archive has pickled stays unread.
 
     Raises:
         UserError: It holds something else than plain numbers.
     """
     try:
-        values = archive[name]
+        values = arrays[name]
     except ValueError as error:
         raise UserError(
             f"{path}: array {name!r} holds pickled Python objects, which are never loaded; "

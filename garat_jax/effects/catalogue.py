@@ -18,6 +18,8 @@ from garat_jax.errors import UserError, choose
 ENTRY_POINTS = "garat_jax.effects"
 """Group of entry points; each names a subclass of `Effect`."""
 PLACES = (*OBJECT_TYPES, "world", "all")
+FLAGS = {"apply": "acts", "tune": "tunes", "sense": "senses", "note": "notes"}
+"""What a class declares that has the method."""
 Catalogue = Mapping[str, type[Effect]]
 """Kinds of effect by name."""
 
@@ -126,6 +128,11 @@ def _check(cls: type[Effect], origin: str) -> None:
             f"{origin}: {cls.__name__}.elements is {elements!r}; expected a tuple of "
             f"{', '.join(PLACES)}"
         )
+    for method, flag in FLAGS.items():
+        if getattr(cls, method) is not getattr(Effect, method) and not getattr(cls, flag):
+            raise UserError(
+                f"{origin}: {cls.__name__} has {method}, which is not called; write {flag} = True"
+            )
     if not cls.parameters():
         raise UserError(f"{origin}: {cls.__name__} has no parameter; declare one by parameter(...)")
     for p in cls.parameters():

@@ -103,40 +103,49 @@ def load_policy(path: Path, model: Model, recordings: Sequence[Recording]) -> Po
         raise UserError(f"{path}: holds no policy; expected a function policy(obs, key)")
     host = model.compile(engine="mujoco").host.model
     obs = jax.ShapeDtypeStruct((host.nq + host.nv,), "float32")
+    key = jax.random.key(0)
     try:
-        command = jax.eval_shape(function, obs, jax.random.key(0))
+        command = jax.eval_shape(function, obs, key)
+        if getattr(command, "shape", None) != (host.nu,):
+            raise UserError(
+                f"{path}: policy(obs, key) returns {command}; expected an array of {host.nu} "
+                f"command{'s' if host.nu > 1 else ''}, shape ({host.nu},)"
+            )
+        for recording in recordings:
+            states = np.concatenate([recording.qpos, recording.qvel], axis=1, dtype="float32")
+            commands = np.asarray(jax.vmap(function, (0, None))(states, key))
+            _check_commands(path, recording, states, commands)
+    except UserError:
+        raise
     except Exception as error:
         where = f"{path}{line_in(path, error)}"
-        if isinstance(error, jax.errors.ConcretizationTypeError):
+        if isinstance(error, jax.errors.TracerBoolConversionError):
             raise UserError(
                 f"{where}: policy(obs, key) takes a decision by a number that is not known while "
                 "JAX traces it; write it with jnp.where"
             ) from error
-        line = " ".join(str(error).split())
+        line = " ".join(str(error).partition("\n")[0].split())
         raise UserError(f"{where}: policy(obs, key): {type(error).__name__}: {line}") from error
-    if getattr(command, "shape", None) != (host.nu,):
-        raise UserError(
-            f"{path}: policy(obs, key) returns {command}; expected an array of {host.nu} "
-            f"command{'s' if host.nu > 1 else ''}, shape ({host.nu},)"
-        )
-
-    for recording in recordings:
-        states = jnp.concatenate([recording.qpos, recording.qvel], axis=1, dtype="float32")
-        commands = np.asarray(jax.vmap(function, (0, None))(states, jax.random.key(0)))
-        wrong = ~np.isfinite(commands).all(axis=1)
-        if wrong.any():
-            i = int(np.argmax(wrong))
-            raise UserError(
-                f"{path}: policy(obs, key) returns {commands[i].tolist()} at "
-                f"{recording.time[i]:.4g} s of {recording.name}, where obs is "
-                f"{np.round(states[i], 4).tolist()}; expected finite numbers"
-            )
 
     def policy(params: Params, obs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         del params
         return jnp.asarray(function(obs, key)), jnp.zeros(())
 
     return policy
+
+
+def _check_commands(
+    path: Path, recording: Recording, states: np.ndarray, commands: np.ndarray
+) -> None:
+    """Refuse a policy that has no finite command [T, nu] for a recorded state [T, nq + nv]."""
+    wrong = ~np.isfinite(commands).all(axis=1)
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        raise UserError(
+            f"{path}: policy(obs, key) returns {commands[i].tolist()} at {recording.time[i]:.4g} s "
+            f"of {recording.name}, where obs is {np.round(states[i], 4).tolist()}; expected finite "
+            "numbers"
+        )
 
 
 def _write_report(run: RunDirectory, done: Grounded, name: str) -> None:

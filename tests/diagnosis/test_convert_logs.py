@@ -240,12 +240,14 @@ def test_without_rosbags_the_extra_is_named(tmp_path, capsys, monkeypatch):
         (OF_ARRAYS.replace("state[0]", "state"), 'time = "t"', "name one column, such as state[0]"),
         (OF_ARRAYS.replace("state[0]", "state[7]"), 'time = "t"', "it has 2 columns"),
         (OF_ARRAYS.replace('"u"', '"u[0]"'), 'time = "t"', "has one column only; leave [0] out"),
+        (OF_ARRAYS.replace('"u"', '"deep"'), 'time = "t"', "expected one or two dimensions"),
+        (OF_ARRAYS.replace('"u"', '"deep[0]"'), 'time = "t"', "expected one or two dimensions"),
         (OF_ARRAYS.replace('"u"', '"short"'), 'time = "t"', "expected one value a sample in each"),
         (OF_ARRAYS, "", 'the samples have no time; add time = "NAME"'),
     ],
 )
 def test_refusals_of_arrays(tmp_path, capsys, columns, time, said):
-    np.savez(tmp_path / "log.npz", **arrays(), short=STAMPS[:5])
+    np.savez(tmp_path / "log.npz", **arrays(), short=STAMPS[:5], deep=np.zeros((5, 2, 3)))
     assert convert(tmp_path, tmp_path / "log.npz", columns, time)[0] == 2
     assert said in capsys.readouterr().err
 

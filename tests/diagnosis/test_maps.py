@@ -78,6 +78,14 @@ def test_a_map_names_columns_of_arrays_in_npz(tmp_path):
         Recording.read(path, MODEL)
 
 
+def test_an_array_may_be_named_like_a_column(tmp_path):
+    path = tmp_path / "log.npz"
+    arrays = {name: values for name, values in FOREIGN.items() if name not in ("mode", "angle")}
+    np.savez(path, **arrays, **{"angle[0]": FOREIGN["angle"]})
+    text = MAP.replace('"angle"', '"angle[0]"')
+    assert len(Recording.read(path, MODEL, write(tmp_path, text)).time) == 50
+
+
 def test_scale_counts_before_the_offset(tmp_path):
     text = MAP.replace('from = "angle", unit = "deg"', 'from = "angle", scale = 0.5, unit = "deg"')
     recording = Recording.read(save(tmp_path), MODEL, read_map(write(tmp_path, text)))
