@@ -84,8 +84,6 @@ class Export:
             from garat_jax.effects.catalogue import load_catalogue
 
             model = load_model(self.model, load_catalogue(self.effects))
-            if self.out.resolve() in (model.path.resolve(), model.mjcf.resolve()):
-                raise UserError(f"--out {self.out} is what MODEL is made of; give another name")
             done = export_mjcf(model, self.out)
             for line in done.unsaid:
                 say(f"not in MJCF: {line}")

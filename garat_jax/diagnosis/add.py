@@ -22,7 +22,7 @@ from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.segments import grid_for
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.suggest import suggest
@@ -176,7 +176,7 @@ def size(
     """
     recordings = thin(checked(recordings))
     host = native_model(model.compile(engine="mujoco"))
-    grid = choose_grid(recordings, host.opt.timestep)
+    grid = grid_for(recordings, host)
     simulator = Simulator(model, (effect,), grid)
     free = [j for j, slot in enumerate(simulator.slots) if slot.parameter.name not in given]
     if not free:

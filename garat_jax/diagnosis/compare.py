@@ -30,7 +30,7 @@ from garat_jax.diagnosis.quality import Quality, assess
 from garat_jax.diagnosis.replay import Replay, Size, lasting_horizons, replay, replay_with
 from garat_jax.diagnosis.residuals import Residuals, examine
 from garat_jax.diagnosis.results import Errors
-from garat_jax.diagnosis.segments import Grid, choose_grid
+from garat_jax.diagnosis.segments import Grid, grid_for
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.torque import TorqueError, compare_torques
@@ -170,7 +170,7 @@ def compare(
     qualities = tuple(assess(r, host) for r in recordings)
     torques = compare_torques(host, recordings)
     recordings = thin(recordings)
-    grid = choose_grid(recordings, host.opt.timestep)
+    grid = grid_for(recordings, host)
     simulator = Simulator(model, (), grid)
     say("choosing the horizon")
     stated, segments = choose_horizon(simulator, recordings, grid)

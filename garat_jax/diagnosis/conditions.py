@@ -23,8 +23,9 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, save_card
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import UNEXPLAINED, Diagnosis
-from garat_jax.diagnosis.segments import Segments, choose_grid
-from garat_jax.diagnosis.simulate import Simulator, Slot
+from garat_jax.diagnosis.segments import Segments, grid_for
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.slots import Slot
 from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.diagnosis.view import as_effects, repaired
 from garat_jax.dynamics import native_model
@@ -200,7 +201,7 @@ def _fit_together(
     selected = [as_effects(model, d.selected) for d in diagnoses]
     kinds = {(e.kind, e.target): e for own in selected for e in own}
     host = native_model(model.compile(engine="mujoco"))
-    grid = choose_grid(everything, host.opt.timestep)
+    grid = grid_for(everything, host)
     unmoved = [type(e)(target=e.target, **e.at(host, e.target)) for e in kinds.values()]
     joint = JointSimulator(Simulator(model, unmoved, grid), selected, condition)
     _, segments = choose_horizon(joint, everything, grid)

@@ -15,7 +15,7 @@ from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.names import is_predicted, renamed, stands_for, twins
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import EQUIVALENT, VISIBLE, Score, cosine, simpler_law
-from garat_jax.diagnosis.simulate import columns_of
+from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import Fit
 from garat_jax.diagnosis.timestep import count_timestep
 

@@ -30,7 +30,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
-from garat_jax.diagnosis.segments import SHORTEST, choose_grid
+from garat_jax.diagnosis.segments import SHORTEST, grid_for
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -69,7 +69,7 @@ def diagnose(
     whole = dataclasses.replace(model, effects=(*model.effects, *shared))
     host = native_model(whole.compile(engine="mujoco"))
     others = make_candidates(whole)
-    grid = choose_grid(everything, host.opt.timestep)
+    grid = grid_for(everything, host)
     say("choosing the horizon")
     plain = Simulator(whole, (), grid)
     horizon, segments = choose_horizon(plain, everything, grid, num_fitted=len(fitted))

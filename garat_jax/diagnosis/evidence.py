@@ -14,7 +14,8 @@ from garat_jax.diagnosis.differences import clear_differences
 from garat_jax.diagnosis.metric import timestep_error
 from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels, tall
 from garat_jax.diagnosis.robust import orthonormal, wald_test, without
-from garat_jax.diagnosis.simulate import Simulator, columns_of
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import Fit
 
 DELAYS = ("actuator_delay", "sensor_delay")

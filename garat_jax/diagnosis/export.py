@@ -37,9 +37,12 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
         path: The MJCF file.
 
     Raises:
-        UserError: MuJoCo cannot compile or read back what was written.
+        UserError: The file is one that the model is made of, or MuJoCo cannot compile or read back
+            what was written.
     """
     path = Path(path)
+    if path.resolve() in (model.path.resolve(), model.mjcf.resolve()):
+        raise UserError(f"{path} is what the model is made of; give another name")
     spec = model.spec.copy()
     for override in model.overrides:
         override.apply(spec)
@@ -54,6 +57,7 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
         text = spec.to_xml()
     except ValueError as error:
         raise UserError(f"MuJoCo cannot compile the model: {error}") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
     try:
         mujoco.MjModel.from_xml_path(str(path))

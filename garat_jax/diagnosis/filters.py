@@ -11,6 +11,12 @@ ORDERS = (2, 4)
 """Orders of the differences that tell noise from motion."""
 UNIFORM = 0.01
 """Largest deviation of a sampling interval, relative to their median, that counts as uniform."""
+TOGGLES = 3
+"""Changes of a signal from which its levels are an encoder's."""
+OFF_GRID = 0.05
+"""Part of a step by which levels may be off the grid."""
+FINEST = 0.02
+"""Part of the median gap between levels that a step is at least."""
 ROWS = 10_000
 """Samples around which polynomials are fitted at once: each has a window of its own in memory."""
 
@@ -32,6 +38,20 @@ def interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.nda
 def held(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return values [T, N], held until their next sample, at other times, [M, N]."""
     return values[np.searchsorted(time, at, side="right") - 1]
+
+
+def held_means(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the means of values [T, N], held until their next sample, around even times, [M, N].
+
+    Each is over half a step to either side. Beyond its ends a signal stays as it is there.
+    """
+    steps = np.diff(time)[:, None]
+    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps * values[:-1], 0)])
+    integral = np.concatenate([integral[:1] - values[:1], integral, integral[-1:] + values[-1:]])
+    time = np.concatenate([[time[0] - 1.0], time, [time[-1] + 1.0]])
+    step = float(np.median(np.diff(at)))
+    low, high = (interpolated(end, time, integral) for end in (at - step / 2, at + step / 2))
+    return (high - low) / step
 
 
 def local_slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -103,12 +123,23 @@ def white_noise(time: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def quantum(values: np.ndarray) -> float:
-    """Return the step of a quantised signal [T], 0 where the values lie on no coarse grid."""
+    """Return the step of a quantised signal [T], 0 where the values lie on no grid.
+
+    Where most values differ, as in a fast motion, steps between some may be missing. Two levels are
+    a grid only if the signal goes back and forth between them.
+    """
     levels = np.unique(values)
-    if len(levels) < 3 or len(levels) > 0.5 * len(values):
+    if len(levels) < 2 or np.count_nonzero(np.diff(values)) < TOGGLES:
         return 0.0
-    steps = np.diff(levels)
-    steps = steps[steps > 1e-6 * float(np.median(steps))]
-    step = float(steps.min())
-    ratio = steps / step
-    return step if np.all(np.abs(ratio - np.round(ratio)) < 0.05 * ratio) else 0.0
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > 1e-6 * float(np.median(gaps))]
+    step = float(gaps.min())
+    if len(levels) <= 0.5 * len(values):
+        ratio = gaps / step
+        return step if np.all(np.abs(ratio - np.round(ratio)) < OFF_GRID * ratio) else 0.0
+    while step > FINEST * float(np.median(gaps)):  # Euclid's, for gaps that are not exact
+        rest = np.abs(gaps - np.round(gaps / step) * step)
+        if np.all(rest < OFF_GRID * step):
+            return step
+        step = float(rest[rest >= OFF_GRID * step].min())
+    return 0.0

@@ -26,7 +26,7 @@ from garat_jax.diagnosis.repeat import found_theta, nominal_effects, repeatabili
 from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosis_sections
 from garat_jax.diagnosis.report_conditions import condition_sections
 from garat_jax.diagnosis.results import Diagnosis, Rung, Verdict
-from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.segments import grid_for
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.view import repaired
@@ -158,7 +158,7 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     """
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
-    grid = choose_grid(everything, model.compile(engine="mujoco").host.model.opt.timestep)
+    grid = grid_for(everything, model.compile(engine="mujoco").host.model)
     effects = nominal_effects(model, added)
     simulator = Simulator(model, effects, grid)
     _, segments = choose_horizon(simulator, everything, grid)

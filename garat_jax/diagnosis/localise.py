@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from scipy import signal
 
+from garat_jax.diagnosis.activation import LONGEST, follow_commands, forgets_in, known_spans
 from garat_jax.diagnosis.columns import signals, torques
 from garat_jax.diagnosis.filters import even_steps, held, interpolated
 from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
@@ -58,6 +59,7 @@ class MissingTorque(NamedTuple):
         actuators: Name of each actuator.
         slides: Whether each dof is a translation, in N and m.
         time: Seconds, [M].
+        elapsed: Part of its recording that has passed, 0 to 1, [M].
         position: [M, nv]; zero for dofs of ball and free joints.
         velocity: [M, nv].
         acceleration: [M, nv].
@@ -67,12 +69,14 @@ class MissingTorque(NamedTuple):
         torque: What is missing, [M, nv].
         ctrl: The actuators' commands, [M, nu].
         drive: Torque of each of the model's actuators at its joint, [M, nu].
+        limited: Whether the force of each is at its limit, [M, nu].
     """
 
     dofs: tuple[str, ...]
     actuators: tuple[str, ...]
     slides: tuple[bool, ...]
     time: np.ndarray
+    elapsed: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
     acceleration: np.ndarray
@@ -82,6 +86,7 @@ class MissingTorque(NamedTuple):
     torque: np.ndarray
     ctrl: np.ndarray
     drive: np.ndarray
+    limited: np.ndarray
 
 
 def missing_torque(model: mujoco.MjModel, recordings: "Sequence[Recording]") -> MissingTorque:
@@ -91,7 +96,12 @@ def missing_torque(model: mujoco.MjModel, recordings: "Sequence[Recording]") -> 
         model: The compiled model, its native fields as its effects leave them.
         recordings: What was measured.
     """
-    parts = [_of_span(model, r, slice(*span)) for r in recordings for span in r.spans]
+    activations = [_activations(model, recording) for recording in recordings]
+    parts = [
+        _of_span(model, r, act, slice(*span))
+        for r, act in zip(recordings, activations, strict=True)
+        for span in known_spans(r, forgets_in(model)) or r.spans
+    ]
     stacked = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
     actuators = tuple(element_names(model, "actuator"))
     slides = tuple(signal.unit == "m/s" for signal in signals(model)[model.nq :])
@@ -153,51 +163,75 @@ def _features(m: MissingTorque, dof: int):
     beyond = np.sign(command) * np.maximum(np.abs(command) - much, 0.0)
     words = f" of the commanded torque beyond {much:.3g}" + " {torque}"
     yield "when much is commanded", beyond, "", words
-    yield "when the command changes", np.gradient(command), "", " of its change in a sample"
+    change = np.gradient(command) if len(command) > 1 else np.zeros_like(command)
+    yield "when the command changes", change, "", " of its change in a sample"
     yield "in proportion to the load", load, "", " of the model's own load torque"
     yield BY_CONTACTS, contact, "", " of the model's own contact torque"
     inertial = m.acceleration[:, dof]
     yield "in proportion to acceleration", inertial, "kg m²", ", {sign} the acceleration"
     yield "with position", position - position.mean(), "N m/rad", ""
-    elapsed = m.time - m.time.min()
-    drift = (elapsed - elapsed.mean()) / max(float(elapsed.max()), 1e-12)
+    drift = m.elapsed - m.elapsed.mean()
     yield "drifting with time", drift, "N m", " from start to end, whatever is commanded"
     words = " of the commanded torque from start to end"
     yield "drifting with time, with the command", drift * command, "", words
 
 
-def _of_span(model: mujoco.MjModel, recording: "Recording", span: slice):
+def _activations(model: mujoco.MjModel, recording: "Recording") -> np.ndarray:
+    """Return the activations at the samples of a recording, [T, na]."""
+    time, step = recording.time, model.opt.timestep
+    if not model.na:
+        return np.zeros((len(time), 0))
+    # Of a long gap no more is followed than makes an activation forget.
+    lasting = np.minimum(np.diff(time), LONGEST)
+    at = np.cumsum([0.0, *lasting])
+    steps = np.arange(int(np.ceil(at[-1] / step)) + 1) * step
+    begin = np.concatenate([recording.qpos[0], recording.qvel[0]])
+    followed = follow_commands(model, begin, held(steps, at, recording.ctrl), step)
+    return interpolated(at, steps, followed)
+
+
+def _of_span(model: mujoco.MjModel, recording: "Recording", activations: np.ndarray, span: slice):
     """Return the columns of `MissingTorque` for one span of one recording, at even steps."""
     sampled = recording.time[span]
     time = even_steps(sampled)
     qpos = interpolated(time, sampled, recording.qpos[span])
     velocity = interpolated(time, sampled, recording.qvel[span])
     ctrl = held(time, sampled, recording.ctrl[span])
+    act = interpolated(time, sampled, activations[span]) if model.na else np.zeros((len(time), 0))
     interval = float(np.median(np.diff(time)))
-    size = max(5, 2 * round(0.5 * WINDOW / interval) + 1)
-    size = min(size, len(time) - 1 + len(time) % 2)
+    size = window_size(time)
     acceleration = signal.savgol_filter(velocity, size, 2, deriv=1, delta=interval, axis=0)
     speed = signal.savgol_filter(velocity, size, 2, axis=0)
+    low, high = model.actuator_forcerange.T
     data = mujoco.MjData(model)
     gears = np.asarray([gear_of(model, actuator) for actuator in range(model.nu)])
     rows = []
     for k in range(len(time)):
         data.qpos[:], data.qvel[:] = qpos[k], speed[k]
-        data.qacc[:], data.ctrl[:] = acceleration[k], ctrl[k]
+        data.qacc[:], data.ctrl[:], data.act[:] = acceleration[k], ctrl[k], act[k]
         mujoco.mj_inverse(model, data)
         needed, load = data.qfrc_inverse.copy(), data.qfrc_bias.copy()
         contact = _contact_torque(model, data)
         mujoco.mj_fwdActuation(model, data)
         drive = data.actuator_force * gears
-        rows.append((needed, load, contact, data.qfrc_actuator.copy(), drive))
-    needed, load, contact, given, drive = (np.asarray(c) for c in zip(*rows, strict=True))
+        at_limit = (data.actuator_force <= low) | (data.actuator_force >= high)
+        limited = at_limit & (model.actuator_forcelimited != 0)
+        rows.append((needed, load, contact, data.qfrc_actuator.copy(), drive, limited))
+    needed, load, contact, given, drive, limited = map(np.asarray, zip(*rows, strict=True))
     both = signal.savgol_filter(np.hstack([given, drive]), size, 2, axis=0)
     given, drive = both[:, : model.nv], both[:, model.nv :]
     position = _positions(model, qpos)
+    elapsed = (time - recording.time[0]) / (recording.time[-1] - recording.time[0])
     edge = slice(size // 2, len(time) - size // 2)
-    of_dofs = (time, position, speed, acceleration, given, load, contact, needed - given)
-    columns = (*of_dofs, ctrl, drive)
+    of_dofs = (time, elapsed, position, speed, acceleration, given, load, contact, needed - given)
+    columns = (*of_dofs, ctrl, drive, limited)
     return tuple(column[edge] for column in columns)
+
+
+def window_size(time: np.ndarray) -> int:
+    """Return how many samples the smoothing filter takes in, odd, of times at even steps."""
+    size = max(5, 2 * round(0.5 * WINDOW / float(np.median(np.diff(time)))) + 1)
+    return min(size, len(time) - 1 + len(time) % 2)
 
 
 def _contact_torque(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:

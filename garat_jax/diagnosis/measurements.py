@@ -91,6 +91,8 @@ class Recording:
             model = native_model(model.compile(engine="mujoco"))
         if isinstance(column_map, str | Path):
             column_map = read_map(column_map)
+        if not model.nq:
+            raise UserError("the model has no joints, so nothing of it can be measured")
         table = _read(path, model, column_map)
         velocity_measured = _check_columns(table, model)
         check_samples(table)
@@ -119,7 +121,9 @@ class Recording:
             spans=spans,
             warnings=(),
         )
-        return dataclasses.replace(recording, warnings=(*warnings, *oddities(recording, model)))
+        return dataclasses.replace(
+            recording, warnings=(*warnings, *oddities(recording, model, wrapped))
+        )
 
 
 def checked(recordings: Iterable[Recording], least: int = 1) -> tuple[Recording, ...]:
@@ -223,12 +227,14 @@ def _split(path: Path, time: np.ndarray) -> tuple[tuple[tuple[int, int], ...], l
             f"{path}: {len(gaps)} gaps longer than {GAP:g} × the usual step of {usual:g} s leave "
             f"no {FEWEST_SAMPLES} samples in a row; record without interruptions"
         )
-    where = ", ".join(f"{time[gap]:g}" for gap in gaps[:5]) + (", ..." if len(gaps) > 5 else "")
+    where = ", ".join(f"{time[gap] - time[0]:.6g}" for gap in gaps[:5])
+    where += ", ..." if len(gaps) > 5 else ""
     dropped = len(time) - sum(b - a for a, b in spans)
+    parts = f"{len(spans)} part{'s' if len(spans) > 1 else ''}"
     lost = f"; {dropped} samples in shorter parts are left out" if dropped else ""
     return spans, [
-        f"{path.name}: {len(gaps)} gap{'s' if len(gaps) > 1 else ''} (at {where} s, usual step "
-        f"{usual:g} s); split there into {len(spans)} part{'s' if len(spans) > 1 else ''}{lost}"
+        f"{path.name}: {len(gaps)} gap{'s' if len(gaps) > 1 else ''} ({where} s after the start, "
+        f"usual step {usual:g} s); split there into {parts}{lost}"
     ]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import Score, cosine
-from garat_jax.diagnosis.simulate import columns_of
+from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import Fit
 
 SAME = 1.0 - 1e-9

@@ -5,11 +5,13 @@ are sampled faster than twice a second, and a motion must be one that the model 
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
+from garat_jax.diagnosis.activation import never_forgetting
 from garat_jax.diagnosis.columns import actuator_names, signals
 from garat_jax.diagnosis.localise import missing_torque
 from garat_jax.diagnosis.units import UNITS
@@ -38,8 +40,16 @@ BETTER = 2.0
 """How much better the model must make the motion in degrees than the one in radians."""
 
 
-def oddities(recording: "Recording", model: mujoco.MjModel) -> list[str]:
-    """Say what is odd about a recording, one line each."""
+def oddities(
+    recording: "Recording", model: mujoco.MjModel, wrapped: Sequence[int] = ()
+) -> list[str]:
+    """Say what is odd about a recording, one line each.
+
+    Args:
+        recording: The recording.
+        model: The model.
+        wrapped: Joints whose angles jumped by a turn of 2π, which are in radians.
+    """
     ratios = _velocity_ratios(recording, model)
     clock = _clock(recording, ratios, model)
     lines = []
@@ -50,7 +60,8 @@ def oddities(recording: "Recording", model: mujoco.MjModel) -> list[str]:
     in_time = {dof: ratio * UNITS[clock].factor for dof, ratio in ratios.items()}
     by_velocity = _contradictions(in_time, model)
     lines += by_velocity.values()
-    lines += _angles(recording, model, suspected=set(by_velocity), timed=clock == "s")
+    told = {*by_velocity, *model.jnt_dofadr[list(wrapped)].tolist()}
+    lines += _angles(recording, model, told, timed=clock == "s")
     lines += _commands(recording, model)
     return [f"{recording.name}: {line}" for line in lines]
 
@@ -129,9 +140,9 @@ def _position_of(dof: int, model: mujoco.MjModel) -> tuple[str, str]:
 
 
 def _angles(
-    recording: "Recording", model: mujoco.MjModel, suspected: set[int], timed: bool
+    recording: "Recording", model: mujoco.MjModel, told: set[int], timed: bool
 ) -> list[str]:
-    """Say which angles look like degrees, of joints that are not suspected already."""
+    """Say which angles look like degrees, but for dofs whose unit is told already."""
     lines, far = [], []
     for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
         dof = int(model.jnt_dofadr[joint])
@@ -141,7 +152,7 @@ def _angles(
         limited = bool(model.jnt_limited[joint])
         beyond = limited and (angle.min() < low - SLACK or angle.max() > high + SLACK)
         name = signals(model)[model.jnt_qposadr[joint]].name
-        if dof in suspected:
+        if dof in told:
             continue
         if largest > LARGEST_ANGLE or beyond:
             span = f" and the joint's range is {low:.3g} to {high:.3g} rad" if limited else ""
@@ -179,8 +190,13 @@ def _misfits(
 
 
 def _commands(recording: "Recording", model: mujoco.MjModel) -> list[str]:
-    """Say which commands the model clamps."""
-    lines = []
+    """Say which commands the model clamps, and which actuators do not follow from them."""
+    lines = [
+        f"actuator {name} integrates its commands, and where it began is not recorded: taken to "
+        "have given no force there"
+        for name in never_forgetting(model)
+    ]
+    clamps = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
     for i, name in enumerate(actuator_names(model)):
         low, high = model.actuator_ctrlrange[i]
         command = recording.ctrl[:, i]
@@ -189,6 +205,6 @@ def _commands(recording: "Recording", model: mujoco.MjModel) -> list[str]:
             lines.append(
                 f"ctrl.{name} is beyond its range {low:g} to {high:g} in "
                 f"{int(beyond.sum())} of {len(command)} samples (from {command.min():.4g} to "
-                f"{command.max():.4g}); the model clamps it"
+                f"{command.max():.4g}); the model {'clamps it' if clamps else 'takes it as it is'}"
             )
     return lines

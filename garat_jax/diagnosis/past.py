@@ -21,12 +21,14 @@ class Past(NamedTuple):
     Attributes:
         ctrl: Command of every simulated step of all recordings, [R, T, nu].
         qvel: Measured velocity in the middle of each, [R, T, nv].
+        act: Activation at the beginning of each, without candidates, [R, T, na].
         recording: Index of each segment's recording, [S].
         num_steps: How many of its steps came before the segment, [S].
     """
 
     ctrl: np.ndarray
     qvel: np.ndarray
+    act: np.ndarray
     recording: np.ndarray
     num_steps: np.ndarray
 
@@ -37,6 +39,11 @@ def has_memory_of_motion(effects: Sequence[Effect], host: mujoco.MjModel) -> boo
         effect.notes or (effect.reads_state and bool(jax.tree.leaves(effect.init(host))))
         for effect in effects
     )
+
+
+def activation_before(past: Past, num_before: int) -> jax.Array:
+    """Return the activation so many steps before a segment, or where its recording begins, [na]."""
+    return jnp.asarray(past.act)[past.recording, jnp.maximum(past.num_steps - num_before, 0)]
 
 
 def lead_steps(grid: Grid) -> int:
@@ -75,4 +82,5 @@ def way_to(
     qpos = jnp.broadcast_to(start[: host.nq], (len(moves), host.nq))
     qpos = qpos.at[:, at].add(-ahead[:, dof])
     shape = (num_steps, substeps, -1)
-    return past.ctrl[past.recording, rows], qpos.reshape(shape), qvel.reshape(shape)
+    ctrl = jnp.asarray(past.ctrl)[past.recording, rows]
+    return ctrl, qpos.reshape(shape), qvel.reshape(shape)

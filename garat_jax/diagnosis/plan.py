@@ -19,11 +19,11 @@ from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
-from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.diagnosis.segments import cut, grid_for
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
 from garat_jax.effects.catalogue import choose_kind
-from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
+from garat_jax.effects.elements import element_names
 from garat_jax.errors import UserError, unknown_name
 from garat_jax.report import styled
 
@@ -103,11 +103,12 @@ def parse_place(text: str, model: Model) -> Place:
     kind, _, target = text.partition("@")
     cls = choose_kind(kind, model.catalogue)
     targets = cls.targets(model.compile(engine="mujoco").host.model)
+    if not targets:
+        raise UserError(f"{kind} can act nowhere in {model.path}: it needs {cls.needs}")
+    if not target and len(targets) != 1:
+        raise UserError(f"{kind} can act at {', '.join(targets)}; write {kind}@TARGET")
     if target and target not in targets:
         raise unknown_name(f"target of {kind}", target, targets)
-    if not target and len(targets) != 1:
-        listed = ", ".join(targets) or "nowhere in this model"
-        raise UserError(f"{kind} can act at {listed}; write {kind}@TARGET")
     return Place(kind, target or targets[0])
 
 
@@ -224,7 +225,7 @@ class _Judge:
         rest = np.concatenate([host.qpos0, np.zeros(host.nv)])
         self._resting = np.tile(rest, (len(time), 1))
         still = self._recording(self._resting, np.zeros((len(time), host.nu)))
-        self._grid = choose_grid([still], host.opt.timestep)
+        self._grid = grid_for([still], host)
         self._simulator = Simulator(model, effects, self._grid)
         self._sizes = [type(e).starts(host, e.target)[0] for e in effects]
         self._places, self._hidden, self._outside = places, set(), set()
@@ -275,10 +276,12 @@ class _Judge:
         host, names = self._host, np.asarray(element_names(self._host, "joint"))
         if not np.isfinite(path).all():
             return {*names.tolist()}
-        single = np.asarray([DOFS_OF_JOINT[int(kind)] == 1 for kind in host.jnt_type], bool)
-        joints = np.flatnonzero(single & (host.jnt_limited != 0))
+        joints = np.flatnonzero(host.jnt_limited)  # never of free ones
         low, high = host.jnt_range[joints].T
         position = path[:, host.jnt_qposadr[joints]]
+        is_ball = host.jnt_type[joints] == mujoco.mjtJoint.mjJNT_BALL  # w of a quaternion
+        turned = 2.0 * np.arccos(np.minimum(np.abs(position), 1.0))
+        position = np.where(is_ball, turned, position)
         beyond = np.maximum(low - position, position - high) / (high - low)
         allowed = BEYOND + np.maximum(beyond[0], 0.0)
         return {*names[joints[np.any(beyond > allowed, axis=0)]].tolist()}

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.segments import Segments
-from garat_jax.diagnosis.simulate import Slot
+from garat_jax.diagnosis.slots import Slot
 from garat_jax.effects import Effect, Suggestion
 
 FEWEST_SEGMENTS = 3

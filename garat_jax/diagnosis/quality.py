@@ -4,6 +4,7 @@ The command lag is read off inverse dynamics: the torque that the motion took is
 the commands of some moments before. It comes before any fit, and so does not say by which effect.
 """
 
+import copy
 import dataclasses
 from collections.abc import Mapping
 
@@ -12,13 +13,15 @@ import numpy as np
 from scipy import signal
 
 from garat_jax.diagnosis.columns import signals
-from garat_jax.diagnosis.filters import even_steps, held, quantum
-from garat_jax.diagnosis.localise import MissingTorque, missing_torque
+from garat_jax.diagnosis.filters import even_steps, held, held_means, quantum
+from garat_jax.diagnosis.localise import MissingTorque, missing_torque, window_size
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.effects.elements import element_names
 
 LAGS = np.arange(-0.02, 0.1001, 0.0005)
 """Seconds among which the lag of commands is sought."""
+LIMITED = 0.01
+"""Part of the time for which an actuator may be at its limit for its lag to be told."""
 TELLING = 1.1
 """How much worse the worst lag must explain the torque than the best, for the best to mean much."""
 
@@ -101,8 +104,8 @@ def command_lags(recording: Recording, model: mujoco.MjModel) -> dict[str, float
     """Estimate how late each actuator's command acts, in seconds; NaN where it does not show.
 
     The needed torque is regressed on the command of d seconds before, beside speed, its sign,
-    load and a constant; the d that leaves the least is the lag. A command is held for
-    a sample, which delays its mean by half of one; that is taken off.
+    load and a constant; the d that leaves the least is the lag. Actuators whose force is at its
+    limit for long do not tell it, nor do those with an activation.
     """
     names = element_names(model, "actuator")
     gains = torque_per_command(model)
@@ -117,7 +120,9 @@ def command_lags(recording: Recording, model: mujoco.MjModel) -> dict[str, float
 
 
 def torque_per_command(model: mujoco.MjModel) -> np.ndarray:
-    """Return how much each command changes each dof's actuator torque at rest, [nv, nu]."""
+    """Return how much each command changes each dof's torque at rest, short of limits, [nv, nu]."""
+    model = copy.copy(model)
+    model.actuator_forcelimited[:], model.jnt_actfrclimited[:] = 0, 0
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     limited = model.actuator_ctrllimited.astype(bool)
@@ -134,23 +139,24 @@ def torque_per_command(model: mujoco.MjModel) -> np.ndarray:
 def _lag(parts: list[tuple[Recording, MissingTorque]], index: int, dof: int, gain: float) -> float:
     """Return the lag of one actuator that explains the torque at one dof best."""
     remainders = np.zeros(len(LAGS))
-    interval = parts[0][0].interval
-    lags = LAGS + 0.5 * interval
+    if np.mean(np.concatenate([m.limited[:, index] for _, m in parts])) > LIMITED:
+        return float("nan")
     for part, m in parts:
         (a, b) = part.spans[0]
-        time = even_steps(part.time[a:b])
-        command = held(time, part.time[a:b], part.ctrl[a:b, [index]])[:, 0]
-        size = min(max(5, 2 * round(0.03 / interval) + 1), len(time) - 1 + len(time) % 2)
-        smooth = gain * np.asarray(signal.savgol_filter(command, size, 2))
+        time, ctrl = part.time[a:b], part.ctrl[a:b, [index]]
+        even = even_steps(time)
+        size = window_size(even)
+        given = gain * np.asarray(signal.savgol_filter(held(even, time, ctrl)[:, 0], size, 2))
         within = (m.time > m.time[0] + LAGS[-1]) & (m.time < m.time[-1] + LAGS[0])
         if within.sum() < 3 * FEATURES:
             continue
         at = m.time[within]
-        target = m.torque[within, dof] + np.interp(at, time, smooth)
+        target = m.torque[within, dof] + np.interp(at, even, given)
         basis = np.linalg.qr(_nuisances(m, dof)[within])[0]
         target = target - basis @ (basis.T @ target)
-        for k, lag in enumerate(lags):
-            late = np.interp(at - lag, time, smooth)
+        for k, lag in enumerate(LAGS):
+            mean = held_means(even - lag, time, ctrl)[:, 0]
+            late = gain * np.interp(at, even, np.asarray(signal.savgol_filter(mean, size, 2)))
             late = late - basis @ (basis.T @ late)
             factor = float(late @ target) / max(float(late @ late), 1e-300)
             remainders[k] += float(np.sum((target - max(factor, 0.0) * late) ** 2))

@@ -22,7 +22,7 @@ from garat_jax.diagnosis.model_card import Model, make_effect
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.diagnosis.screen import screen
-from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.segments import grid_for
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.timestep import count_timestep
@@ -114,7 +114,7 @@ def _alone(
         return {}
     everything = thin((*parts[0], *parts[1]))
     host = native_model(model.compile(engine="mujoco"))
-    grid = choose_grid(everything, host.opt.timestep)
+    grid = grid_for(everything, host)
     effects = (*nominal_effects(model, selected), *_rivals(model, selected, candidates))
     simulator = Simulator(model, effects, grid)
     theta = found_theta(simulator, selected)
@@ -187,9 +187,9 @@ def _summaries(sightings: Mapping[_Parameter, list[Sighting]]) -> tuple[Repeated
 
 
 def _summary(parameter: _Parameter, seen: list[Sighting]) -> Repeated:
-    usable = [s for s in seen if np.isfinite([s.estimate, s.low, s.high]).all()]
+    usable = [s for s in seen if np.isfinite([s.estimate, s.low, s.high]).all() and s.low < s.high]
     sizes = np.asarray([s.estimate for s in usable])
-    errors = np.asarray([max(s.high - s.low, 1e-300) / 3.92 for s in usable])
+    errors = np.asarray([(s.high - s.low) / 3.92 for s in usable])
     p_value = 1.0
     if len(usable) > 1:
         weight = 1.0 / errors**2

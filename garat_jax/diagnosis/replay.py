@@ -11,7 +11,7 @@ from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.measurements import Recording, longest_span
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.segments import QUIET, Grid, Segments, choose_grid, cut, metric_spread
+from garat_jax.diagnosis.segments import QUIET, Grid, Segments, cut, grid_for, metric_spread
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.velocity import estimate_velocity
@@ -121,8 +121,8 @@ def replay(
         recordings: What was measured.
         horizons: Seconds of a segment, and the numbers of the recordings to predict over it.
     """
-    timestep = model.compile(engine="mujoco").host.model.opt.timestep
-    grid = choose_grid(recordings, timestep)
+    host = model.compile(engine="mujoco").host.model
+    grid = grid_for(recordings, host)
     simulator = Simulator(model, (), grid)
     return tuple(
         replay_with(simulator, recordings, grid, horizon, chosen)

@@ -87,17 +87,15 @@ class Residuals:
 def examine(played: Replay, recordings: Sequence[Recording], inputs: Sequence[str]) -> Residuals:
     """Test a model's residuals for whiteness and for independence of the commands.
 
-    Lags are samples: of recordings at several rates, those at the highest are tested.
+    Lags are samples: of recordings at several rates, those at the highest are tested that measured
+    the signal.
 
     Args:
         played: Predictions of the recordings.
         recordings: What was measured.
         inputs: Names of the commands.
     """
-    intervals = np.asarray([r.interval for r in recordings])
-    interval = float(intervals.min())
-    is_tested = (intervals <= ALIKE * interval)[played.segments.recording]
-    counts = played.segments.counts * is_tested[:, None, None]
+    intervals = np.asarray([r.interval for r in recordings])[played.segments.recording]
     weight = played.segments.weight
     rows = [
         np.minimum(first + np.arange(weight.shape[1]), len(recordings[r].time) - 1)
@@ -109,7 +107,9 @@ def examine(played: Replay, recordings: Sequence[Recording], inputs: Sequence[st
     lags = min(LAGS, weight.shape[1] - 2)
     whiteness, independence = [], []
     for i, name in enumerate(played.names):
-        weight = counts[..., i]
+        interval = float(intervals[played.segments.observed[:, i]].min())
+        is_tested = intervals <= ALIKE * interval
+        weight = played.segments.counts[..., i] * is_tested[:, None]
         residual = _centred(played.deviation[..., i], weight)
         own = _correlation(residual, residual, lags)
         num = float(weight.sum())
@@ -120,9 +120,9 @@ def examine(played: Replay, recordings: Sequence[Recording], inputs: Sequence[st
         correlation = tuple(map(float, own[1:]))
         whiteness.append(Whiteness(name, seconds[1:], correlation, bound, outside, white))
         for j, command in enumerate(inputs):
-            driving = _centred(commands[..., j], weight)
-            if not np.any(driving):
+            if np.ptp(commands[..., j][weight > 0]) == 0:
                 continue
+            driving = _centred(commands[..., j], weight)
             with_input = _correlation(residual, driving, lags)
             of_input = _correlation(driving, driving, lags)
             spread = 1.0 + 2.0 * float(np.sum(own[1:] * of_input[1:]))

@@ -7,21 +7,28 @@ positions are no measurements: they say nothing that the positions do not, so th
 import dataclasses
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 from scipy import integrate, optimize
 
+from garat_jax.diagnosis.activation import forgets_in, known_spans
 from garat_jax.diagnosis.filters import UNIFORM
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.errors import UserError
 
 WARM_UP = 0.1
-"""Seconds of commands before each segment: they fill delays and activations (at most 0.1 s)."""
+"""Seconds of commands before each segment, at least: they fill delays and activations."""
 LONGEST_GAP = 1.0
 """Seconds that a gap in a recording counts at most, for what is remembered of before it."""
 SHORTEST = 10
 """Samples that a segment must have."""
 SLOWEST = 0.5
 """Seconds between samples, at most: a segment would last for 5 s, too long to be followed."""
+SLIP = 0.05
+"""Samples by which those of a recording may be off from even ones, at most, at the end of
+`FOLLOWED` seconds."""
+FOLLOWED = 2.0
+"""Seconds of the longest segments."""
 SMALLEST_NOISE = 1e-4
 """Noise assumed at least, relative to the signal's standard deviation."""
 UNKNOWN_NOISE = 1e-6
@@ -55,6 +62,7 @@ class Segments:
             [R, T, nu].
         past_qvel: Measured velocity in the middle of each of these steps, 0 in gaps, [R, T, nv].
         num_past: How many of these steps came before the segment, [S].
+        begins: Measured state where each recording begins, [R, nq + nv].
         noise: Standard deviation of each signal's noise, [num_signals].
         spread: Standard deviation of each signal, `QUIET` times its noise at least, [num_signals].
         start_unit: What the initial states differ by, a unit of each component, [nq + nv].
@@ -74,6 +82,7 @@ class Segments:
     past: np.ndarray
     past_qvel: np.ndarray
     num_past: np.ndarray
+    begins: np.ndarray
     noise: np.ndarray
     spread: np.ndarray
     start_unit: np.ndarray
@@ -106,13 +115,15 @@ class Grid:
         interval: Seconds of one simulated step.
         substeps: Physics substeps in it.
         per_sample: Simulated steps a sample; samples lie on steps where sampling is uniform.
-        uniform: Whether every recording is sampled uniformly at the same rate.
+        uniform: Whether every recording is sampled uniformly at the same rate, within `SLIP`.
+        forgets: Seconds after which activations have forgotten how they began; see `activation`.
     """
 
     interval: float
     substeps: int
     per_sample: int
     uniform: bool
+    forgets: float = 0.0
 
     @property
     def timestep(self) -> float:
@@ -123,6 +134,16 @@ class Grid:
     def sample(self) -> float:
         """Seconds between samples."""
         return self.interval * self.per_sample
+
+
+def grid_for(recordings: Sequence[Recording], host: mujoco.MjModel) -> Grid:
+    """Match a model to the sampling, and to its activations; see `choose_grid`.
+
+    Raises:
+        UserError: Samples are too far apart to follow a motion.
+    """
+    grid = choose_grid(recordings, host.opt.timestep)
+    return dataclasses.replace(grid, forgets=forgets_in(host))
 
 
 def choose_grid(recordings: Sequence[Recording], timestep: float) -> Grid:
@@ -143,11 +164,12 @@ def choose_grid(recordings: Sequence[Recording], timestep: float) -> Grid:
                 f"follow a motion; at most {SLOWEST:g} s are. Is time in another unit than "
                 "seconds? A map file names it"
             )
-    intervals = np.concatenate([np.diff(r.time[a:b]) for r in recordings for a, b in r.spans])
-    sample = float(np.median(intervals))
-    is_uniform = bool(np.abs(intervals - sample).max() <= UNIFORM * sample)
-    if not is_uniform:
-        sample = min(r.interval for r in recordings)
+    intervals = [np.concatenate([np.diff(r.time[a:b]) for a, b in r.spans]) for r in recordings]
+    sample = float(np.mean(np.concatenate(intervals)))
+    slips = [abs(i.mean() - sample) / sample * FOLLOWED / sample for i in intervals]
+    is_uniform = max(np.abs(i - sample).max() for i in intervals) <= UNIFORM * sample
+    if not (is_uniform and max(slips) <= SLIP):
+        is_uniform, sample = False, min(r.interval for r in recordings)
     substeps = max(1, int(np.ceil(sample / timestep - 1e-6)))
     if is_uniform:
         return Grid(sample, substeps, 1, True)
@@ -156,6 +178,8 @@ def choose_grid(recordings: Sequence[Recording], timestep: float) -> Grid:
 
 def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments:
     """Cut recordings into segments of a horizon, each with the commands that led to it.
+
+    Where activations are unknown, at the beginning of a recording, there are none.
 
     Args:
         recordings: What was measured.
@@ -171,7 +195,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     pieces = [
         (index, start, min(start + length, stop))
         for index, (r, length) in enumerate(zip(recordings, lengths, strict=True))
-        for a, stop in r.spans
+        for a, stop in known_spans(r, grid.forgets)
         for start in range(a, stop, length)
         if min(start + length, stop) - start >= SHORTEST
     ]
@@ -213,6 +237,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         past=_past(recordings, before),
         past_qvel=_past_qvel(recordings, before),
         num_past=np.asarray([before[i][a] for i, a, _ in pieces]),
+        begins=np.stack([np.concatenate([r.qpos[0], r.qvel[0]]) for r in recordings]),
         noise=deviations,
         spread=np.maximum(spread, QUIET * deviations),
         start_unit=_unit(start),
@@ -251,7 +276,7 @@ def _noise_of_still(noise: np.ndarray, is_still: np.ndarray) -> np.ndarray:
 
 def warm_up_steps(grid: Grid, num_actuators: int) -> int:
     """Return the steps before each segment; without actuators nothing has to fill."""
-    return int(np.ceil(WARM_UP / grid.interval)) if num_actuators else 0
+    return int(np.ceil(max(WARM_UP, grid.forgets) / grid.interval)) if num_actuators else 0
 
 
 def signal_noise(recording: Recording) -> np.ndarray:

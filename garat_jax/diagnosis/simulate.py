@@ -15,11 +15,19 @@ import numpy as np
 
 from garat_jax import dynamics
 from garat_jax.compiler_options import options_of_replay
+from garat_jax.diagnosis.activation import Follower
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.diagnosis.past import Past, has_memory_of_motion, lead_steps, way_to
+from garat_jax.diagnosis.past import (
+    Past,
+    activation_before,
+    has_memory_of_motion,
+    lead_steps,
+    way_to,
+)
 from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
+from garat_jax.diagnosis.slots import Slot, columns_of
 from garat_jax.dynamics import Override
-from garat_jax.effects import Effect, Parameter
+from garat_jax.effects import Effect
 from garat_jax.errors import UserError
 
 NUM_PROGRAMS, NUM_FINER = 40, 4
@@ -32,25 +40,6 @@ substep, many simulations share its cost. Each size is compiled once."""
 FEW = 4
 """Candidates up to which a program is optimised. In those that fit them, which run often, few act;
 in those of screening, which run a few times, as many as a model has places for them."""
-
-
-class Slot(NamedTuple):
-    """One parameter of one candidate effect.
-
-    Attributes:
-        effect: Index among the candidate effects.
-        parameter: Its declaration.
-        base: The value to begin with: "no effect" here, or what the effect has already.
-    """
-
-    effect: int
-    parameter: Parameter
-    base: float
-
-
-def columns_of(slots: Sequence[Slot], effect: int) -> dict[str, int]:
-    """Return where one candidate's parameters stand in `theta`, by their names."""
-    return {slot.parameter.name: j for j, slot in enumerate(slots) if slot.effect == effect}
 
 
 class Program(NamedTuple):
@@ -125,6 +114,7 @@ class Simulator:
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
         self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
         self._transform = model.transform
+        self._follower = Follower(self.host, grid.interval)
         self._any_at_once = dynamics.steps_at_once(self._alone) and model.transform is None
         self._jitted = functools.lru_cache(NUM_PROGRAMS if refine <= 2 else NUM_FINER)(self._jit)
 
@@ -261,8 +251,9 @@ class Simulator:
         acting = (*world.effects, *(self.effects[i] for i in chosen))
         looks_back = any(effect.remembers for effect in acting)
         looks_back |= way == "stepped" and has_memory_of_motion(acting, self.host)
+        looks_back |= self.host.na > 0
         one = functools.partial(predict, world, chosen)
-        past = Past._make((None, None, 0, 0)) if looks_back else None
+        past = Past._make((None, None, None, 0, 0)) if looks_back else None
         axes = (0, 0, 0, 0, past, 0)[: 6 if way == "along" else 5]
         options = options_of_replay(self._alone.engine, runs_often=len(chosen) <= FEW)
         run = jax.jit(jax.vmap(one, axes), compiler_options=options)
@@ -278,6 +269,7 @@ class Simulator:
         total = num_rows * num_segments
         size = BATCH_SIZES[program.is_stepped and total > 2 * BATCH_SIZES[0]]
         starts = start.reshape(total, -1)
+        activations = self._follower(segments.begins, segments.past)
         found, paths = [], []
         for first in range(0, total, size):
             chosen = np.minimum(np.arange(first, first + size), total - 1)
@@ -287,7 +279,7 @@ class Simulator:
             begin[total - first :] = np.nan  # padding: C MuJoCo leaves it out
             own = theta[row, segment] if theta.ndim > 2 else theta[row]
             before = (segments.recording[segment], segments.num_past[segment])
-            past = Past(segments.past, segments.past_qvel, *before)
+            past = Past(segments.past, segments.past_qvel, activations, *before)
             inputs = (own, begin, segments.ctrl[segment], segments.place[segment])
             inputs = (*inputs, past if program.looks_back else None)
             with jax.enable_x64(True):
@@ -315,7 +307,11 @@ class Simulator:
         """Return a segment's start, remembering all commands but the last `num_before`."""
         num_position = self.host.nq
         state = dynamics.initial_state(world, start[:num_position], start[num_position:])
-        if not any(effect.remembers for effect in world.effects):
+        remembers = any(effect.remembers for effect in world.effects)
+        if self.host.na:
+            since = past.num_steps if remembers else num_before
+            state = state._replace(act=activation_before(past, since))
+        if not remembers:
             return state
 
         def remember(k, state):

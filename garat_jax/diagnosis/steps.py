@@ -29,7 +29,7 @@ from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, noise_
 from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import screen
-from garat_jax.diagnosis.simulate import columns_of
+from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import Fit
 
 NEWCOMERS = 2

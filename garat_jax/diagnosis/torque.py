@@ -9,9 +9,11 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+from scipy import signal
 
 from garat_jax.diagnosis.columns import torques
-from garat_jax.diagnosis.localise import MissingTorque, missing_torque
+from garat_jax.diagnosis.filters import even_steps
+from garat_jax.diagnosis.localise import MissingTorque, missing_torque, window_size
 from garat_jax.diagnosis.measurements import Recording
 
 
@@ -24,7 +26,8 @@ class TorqueError:
         unit: N m or N.
         measured_rms: Root mean square of the measured torque.
         actuator_rmse: Against what the model's actuators give for the recorded commands.
-        actuator_fit_percent: The same as 100 (1 - |τ - τ̂| / |τ - mean τ|).
+        actuator_fit_percent: The same as 100 (1 - |τ - τ̂| / |τ - mean τ|); NaN where the measured
+            torque never changes.
         motion_rmse: Against what the model needs for the recorded motion (inverse dynamics).
         motion_fit_percent: The same in per cent.
     """
@@ -64,27 +67,31 @@ def compare_torques(
     ]
     missing = [(span, missing_torque(model, [span])) for span in spans]
     found = []
-    for dof, signal in enumerate(torques(model)):
-        joint = signal.name.partition(".")[2]
+    for dof, (name, unit) in enumerate(torques(model)):
+        joint = name.partition(".")[2]
         rows = [_of_span(span, m, joint, dof) for span, m in missing if joint in span.torque]
         if rows:
             measured, given, needed = (np.concatenate(c) for c in zip(*rows, strict=True))
             of_actuator, of_motion = _error(measured, given), _error(measured, needed)
             rms = float(np.sqrt(np.mean(measured**2)))
-            found.append(TorqueError(joint, signal.unit, rms, *of_actuator, *of_motion))
+            found.append(TorqueError(joint, unit, rms, *of_actuator, *of_motion))
     return tuple(found)
 
 
 def _of_span(recording: Recording, missing: MissingTorque, joint: str, dof: int):
     """Return measured, given and needed torque along a recording of one span, [M] each."""
     ((a, b),) = recording.spans
-    measured = np.interp(missing.time, recording.time[a:b], recording.torque[joint][a:b])
+    time = even_steps(recording.time[a:b])
+    measured = np.interp(time, recording.time[a:b], recording.torque[joint][a:b])
+    smooth = np.asarray(signal.savgol_filter(measured, window_size(time), 2))
+    measured = np.interp(missing.time, time, smooth)
     given = missing.command[:, dof]
     return measured, given, given + missing.torque[:, dof]
 
 
 def _error(measured: np.ndarray, modelled: np.ndarray) -> tuple[float, float]:
-    """Return the root mean square error and the fit in per cent."""
+    """Return the root mean square error and the fit in per cent; NaN where nothing changes."""
     rest = float(np.linalg.norm(measured - modelled))
-    spread = float(np.linalg.norm(measured - measured.mean())) or 1e-12
-    return rest / len(measured) ** 0.5, 100 * (1 - rest / spread)
+    spread = float(np.linalg.norm(measured - measured.mean()))
+    changes = spread > 1e-9 * float(np.linalg.norm(measured))
+    return rest / len(measured) ** 0.5, 100 * (1 - rest / spread) if changes else float("nan")

@@ -130,6 +130,7 @@ def handmade(predicted, measured, weight) -> Replay:
         past=empty,
         past_qvel=empty,
         num_past=np.zeros(len(measured), int),
+        begins=empty,
         noise=np.asarray([0.1]),
         spread=np.asarray([2.0]),
         start_unit=np.ones(1),

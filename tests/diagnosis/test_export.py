@@ -242,14 +242,14 @@ def test_the_model_itself_is_not_written_over(tmp_path, capsys):
     write(tmp_path)
     path = str(tmp_path / "arm.xml")
     assert cli.main(["export", path, "--out", path, "--force"]) == 2
-    assert "is what MODEL is made of" in capsys.readouterr().err
+    assert "is what the model is made of" in capsys.readouterr().err
 
 
 def test_the_mjcf_of_a_card_is_not_written_over(tmp_path, capsys):
     card, path = write(tmp_path), tmp_path / "arm.xml"
     before = path.read_text()
     assert cli.main(["export", str(card), "--out", str(path), "--force"]) == 2
-    assert "is what MODEL is made of" in capsys.readouterr().err
+    assert "is what the model is made of" in capsys.readouterr().err
     assert path.read_text() == before
     assert (tmp_path / "arm.xml").read_text() == models.ARM
 

@@ -35,7 +35,9 @@ def lacking(torque, slides=False) -> MissingTorque:
     columns = (rest / 5.7, SPEED, -5.7 * rest, COMMAND, load, CONTACT, torque)
     nothing = np.zeros((len(TIME), 0))
     of_dofs = (c[:, None] for c in columns)
-    return MissingTorque(("joint",), (), (slides,), TIME, *of_dofs, nothing, nothing)
+    return MissingTorque(
+        ("joint",), (), (slides,), TIME, TIME / 10.0, *of_dofs, nothing, nothing, nothing
+    )
 
 
 @pytest.mark.parametrize("regime", PARTS)
@@ -84,6 +86,26 @@ def test_contacts_and_slides_are_those_of_the_model():
     assert missing.slides == (True, True)
     weight = 0.5 * 9.81
     np.testing.assert_allclose(missing.contact, [[weight, 0.0]] * len(missing.time), atol=0.05)
+
+
+def test_time_counts_within_each_recording_whatever_its_clock_says():
+    model = models.spec(models.PENDULUM).compile()
+    nothing = np.zeros((100, 1))
+    time, rest = np.arange(100) * 0.01, (nothing, nothing, nothing, {}, True, ((0, 100),), ())
+    made = [Recording("a", time, *rest), Recording("b", 1.7e9 + time, *rest)]
+    elapsed = missing_torque(model, made).elapsed
+    first, second = np.split(elapsed, 2)
+    np.testing.assert_allclose(first, second, atol=1e-6)
+    assert 0 < first[0] < 0.1 and 0.9 < first[-1] < 1
+
+
+def test_few_samples_have_a_place_too():
+    model = models.spec(models.PENDULUM).compile()
+    nothing = np.zeros((21, 1))
+    rest = (nothing, nothing + 1.0, nothing, {}, True, ((0, 21),), ())
+    missing = missing_torque(model, [Recording("a", np.arange(21) * 1e-3, *rest)])
+    assert len(missing.time) == 1
+    assert all(np.isfinite(place.share) for place in localise(missing))
 
 
 def test_a_place_names_the_direction_of_a_joint_that_has_several():

@@ -176,7 +176,7 @@ def test_gap_is_split_with_a_warning(tmp_path):
     recording = Recording.read(save(tmp_path, columns(time=time)), MODEL)
     assert recording.spans == ((0, 120), (120, 200))
     assert recording.warnings == (
-        "run.csv: 1 gap (at 0.476 s, usual step 0.004 s); split there into 2 parts",
+        "run.csv: 1 gap (0.476 s after the start, usual step 0.004 s); split there into 2 parts",
     )
 
 

@@ -63,7 +63,7 @@ def test_the_way_ends_at_the_start_and_follows_what_was_measured():
     host = models.spec(GEARED).compile()
     grid = Grid(0.01, 2, 1, True)
     qvel = np.arange(300.0)[None, :, None]
-    past = Past(np.zeros((1, 300, 1)), qvel, np.asarray(0), np.asarray(150))
+    past = Past(np.zeros((1, 300, 1)), qvel, np.zeros((1, 300, 0)), np.asarray(0), np.asarray(150))
     start = jnp.asarray([0.3, 7.0])
     ctrl, qpos, qvel = way_to(start, past, host, grid, 2)
     assert (ctrl.shape, qpos.shape, qvel.shape) == ((100, 1), (100, 2, 1), (100, 2, 1))
@@ -76,7 +76,13 @@ def test_the_way_ends_at_the_start_and_follows_what_was_measured():
 
 def test_before_the_recording_the_mechanism_stays():
     host = models.spec(GEARED).compile()
-    past = Past(np.zeros((1, 300, 1)), np.ones((1, 300, 1)), np.asarray(0), np.asarray(40))
+    past = Past(
+        np.zeros((1, 300, 1)),
+        np.ones((1, 300, 1)),
+        np.zeros((1, 300, 0)),
+        np.asarray(0),
+        np.asarray(40),
+    )
     _, qpos, qvel = way_to(jnp.asarray([0.3, 1.0]), past, host, Grid(0.01, 1, 1, True), 1)
     np.testing.assert_array_equal(qvel[:60, 0, 0], 0.0)
     np.testing.assert_array_equal(qvel[60:, 0, 0], 1.0)

@@ -7,7 +7,7 @@ import pytest
 
 from garat_jax import cli
 from garat_jax.diagnosis import load_model
-from garat_jax.diagnosis.plan import Place, plan
+from garat_jax.diagnosis.plan import Place, _Judge, plan
 from garat_jax.errors import UserError
 from tests import models
 
@@ -90,6 +90,31 @@ def test_joints_stay_within_their_ranges(tmp_path, kind):
     low, high = np.deg2rad([-20.1, 35.1])
     assert low < min(angles) < -0.05 < 0.05 < max(angles) < high
     assert planned.after < 0.99
+
+
+def test_a_kind_without_a_place_is_refused(tmp_path):
+    path = tmp_path / "nameless.xml"
+    path.write_text(models.PENDULUM.replace('body name="pole"', "body"))
+    with pytest.raises(UserError, match=r"payload_mass can act nowhere in .*: it needs"):
+        plan(load_model(path), "payload_mass", "viscous_damping")
+
+
+def test_balls_stay_within_their_cones(tmp_path):
+    path = tmp_path / "ball.xml"
+    joint = 'type="ball" limited="true" range="0 20"'
+    path.write_text(
+        models.PENDULUM.replace('axis="0 1 0" damping', f"{joint} damping")
+        .replace("<motor", '<motor gear="0 1 0"')
+        .replace('<sensor><jointpos name="angle" joint="hinge"/></sensor>', "")
+    )
+    model = load_model(path)
+    places = Place("gravity_scale", "world"), Place("motor_gain", "actuator/motor")
+    limits = model.spec.copy().compile().actuator_ctrlrange
+    judge = _Judge(model, places, np.arange(10) * 0.01, limits)
+    turned = np.deg2rad([[0.0], [15.0]]), np.deg2rad([[0.0], [29.0]])
+    for angle, beyond in zip(turned, (set(), {"hinge"}), strict=True):
+        qpos = np.concatenate([np.cos(angle / 2), 0 * angle, np.sin(angle / 2), 0 * angle], axis=1)
+        assert judge._beyond(np.concatenate([qpos, np.zeros((2, 3))], axis=1)) == beyond
 
 
 def test_an_actuator_without_limits_is_refused(tmp_path, capsys):

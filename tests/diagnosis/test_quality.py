@@ -2,10 +2,12 @@
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 
 from garat_jax.diagnosis import Recording
+from garat_jax.diagnosis.filters import quantum, white_noise
 from garat_jax.diagnosis.hidden import ANGLE_NOISE, SPEED_NOISE, make_recordings
 from garat_jax.diagnosis.quality import assess, command_lags, torque_per_command
 from tests import models
@@ -37,6 +39,48 @@ def test_commands_in_time_have_no_lag(tmp_path, kind):
         assert command_lags(recording, MODEL)["motor"] == pytest.approx(0.0, abs=2e-3)
 
 
+@pytest.mark.parametrize("jitter", [0.0, 1e-3])
+@pytest.mark.parametrize("lag", [0.0, 0.012])
+def test_lags_are_exact_however_samples_come(lag, jitter):
+    """Samples of an exact simulation, at even times or not; commands act as they are or later."""
+    fine = models.spec(models.PENDULUM)
+    fine.option.timestep = 2.5e-4
+    model = fine.compile()
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    time = np.arange(1000) * 0.004 + jitter * rng.uniform(-1, 1, 1000)
+    every = np.arange(time[-1], step=2.5e-4)
+    ctrl = rng.uniform(-1, 1, 41)[(time / 0.1).astype(int)]
+    late = ctrl[np.maximum(np.searchsorted(time, every - lag, side="right") - 1, 0)]
+    path = []
+    for command in late:
+        path.append((data.qpos[0], data.qvel[0]))
+        data.ctrl[0] = command
+        mujoco.mj_step(model, data)
+    qpos, qvel = (np.interp(time, every, column)[:, None] for column in np.transpose(path))
+    made = Recording("made", time, qpos, qvel, ctrl[:, None], {}, True, ((0, 1000),), ())
+    assert command_lags(made, MODEL)["motor"] == pytest.approx(lag, abs=5e-4)
+
+
+def test_an_actuator_at_its_limit_does_not_tell_its_lag():
+    servo = '<position kp="50" kv="1"'
+    free = models.spec(models.PENDULUM.replace("<motor", servo)).compile()
+    weak = models.spec(models.PENDULUM.replace("<motor", f'{servo} forcerange="-1 1"')).compile()
+    np.testing.assert_allclose(torque_per_command(weak), torque_per_command(free))
+    rng = np.random.default_rng(0)
+    data = mujoco.MjData(free)
+    rows = []
+    for target in np.repeat(rng.uniform(-0.3, 0.3, 50), 40):
+        rows.append((data.qpos[0], data.qvel[0], target))
+        data.ctrl[0] = target
+        mujoco.mj_step(free, data)
+    qpos, qvel, ctrl = np.asarray(rows).T[..., None]
+    time = np.arange(len(rows)) * free.opt.timestep
+    made = Recording("made", time, qpos, qvel, ctrl, {}, True, ((0, len(time)),), ())
+    assert command_lags(made, free)["motor"] == pytest.approx(0.0, abs=2e-3)
+    assert np.isnan(command_lags(made, weak)["motor"])
+
+
 def test_without_excitation_no_lag_is_claimed(tmp_path):
     _, recordings = record(tmp_path, seconds=3.0)
     still = dataclasses.replace(recordings[0], ctrl=np.zeros_like(recordings[0].ctrl))
@@ -64,6 +108,21 @@ def test_the_step_of_an_encoder_is_told(tmp_path):
     assert quality.channels["qpos.hinge"].step == pytest.approx(step, rel=1e-3)
     assert list(quality.channels) == ["qpos.hinge"]
     assert quality.velocity == "estimated"
+
+
+@pytest.mark.parametrize("speed", [0.0, 3.0])
+def test_an_encoder_has_noise_where_it_rests_and_where_it_runs(speed):
+    """Two counts by turns, or hardly one twice: noise is a step over the square root of 12."""
+    step = 2 * np.pi / 4096
+    rng = np.random.default_rng(0)
+    time = np.arange(1500) * 0.002
+    angle = speed * time + 0.3 * (speed > 0) * np.sin(2 * time) + 0.49 * step
+    angle = np.round((angle + 0.005 * step * rng.normal(size=1500)) / step) * step
+    assert quantum(angle) == pytest.approx(step)
+    (noise,) = white_noise(time, angle[:, None])
+    assert step / 12**0.5 <= noise * (1 + 1e-9) and noise < step
+    assert quantum(np.where(time < 1.0, 0.0, 0.1)) == 0.0  # it moved once
+    assert quantum(rng.normal(size=1500)) == 0.0
 
 
 def test_torque_per_command_is_gear_and_gain():

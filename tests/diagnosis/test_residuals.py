@@ -58,6 +58,33 @@ def test_what_follows_the_command_is_not_independent():
     assert with_input.seconds[7] == pytest.approx(0.07)
 
 
+def test_velocities_that_only_a_slower_recording_has_are_tested_there():
+    """A signal that the fastest recording did not measure has its own rate."""
+    rng = np.random.default_rng(0)
+    residual = rng.normal(size=(NUM, LENGTH, 2))
+    played = handmade(residual, np.zeros_like(residual), np.ones((NUM, LENGTH)))
+    recording = np.arange(NUM) % 2
+    observed = np.stack([np.ones(NUM, bool), recording == 1], axis=1)
+    first = np.arange(NUM) // 2 * LENGTH
+    segments = dataclasses.replace(
+        played.segments, recording=recording, first=first, observed=observed,
+        trust=np.ones_like(residual),
+    )  # fmt: skip
+    played = dataclasses.replace(
+        played, segments=segments, names=("qpos.hinge", "qvel.hinge"), units=("rad", "rad/s")
+    )
+    total = NUM // 2 * LENGTH
+    rest = (np.zeros((total, 1)), np.zeros((total, 1)), rng.normal(size=(total, 1)), {}, True)
+    made = [
+        Recording(name, np.arange(total) * step, *rest, ((0, total),), ())
+        for name, step in (("fast", 0.01), ("slow", 0.04))
+    ]
+    position, velocity = examine(played, made, ["motor"]).whiteness
+    assert (position.seconds[0], velocity.seconds[0]) == pytest.approx((0.01, 0.04))
+    assert position.bound == pytest.approx(velocity.bound)
+    assert position.white and velocity.white
+
+
 def test_constant_commands_are_left_out():
     found = examined(lambda u, rng: rng.normal(size=len(u)))
     assert len(found.independence) == 1

@@ -42,6 +42,17 @@ def test_recordings_of_several_rates_are_cut_into_segments_that_last_alike(horiz
         assert np.bincount(segments.recording).tolist() == [round(8 / horizon)] * 2
 
 
+@pytest.mark.parametrize(("other", "alike"), [(0.004 * (1 + 2e-5), True), (0.00397, False)])
+def test_rates_that_differ_a_little_are_not_taken_for_one(other, alike):
+    made = [sampled(np.arange(2000) * 0.004), sampled(np.arange(2000) * other)]
+    grid = choose_grid(made, TIMESTEP)
+    assert grid.uniform == alike
+    segments = cut(made, grid, 2.0)
+    at = segments.place * grid.interval
+    last = [at[segments.recording == r][0].max() for r in (0, 1)]
+    assert last == pytest.approx([0.004 * 499, other * (499 if alike else 503)], abs=2e-4)
+
+
 def test_a_rest_of_a_recording_is_not_whole():
     segments = cut([sampled(np.arange(580) / 250)], choose_grid([sampled([0, 0.004])], 0.002), 0.5)
     assert segments.weight.sum(axis=1).tolist() == [125.0] * 4 + [80.0]

@@ -34,13 +34,16 @@ HARDLY = 1e-9
 
 @struct.dataclass
 class Broken(MotorGain):
-    """A gain that is no number at its nominal."""
+    """A gain that is no number after ten substeps."""
 
     kind: ClassVar[str] = "broken"
     acts: ClassVar[bool] = True
 
+    def init(self, host):
+        return jnp.zeros(())
+
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
-        return ctrl * jnp.log(self.scale) / jnp.log(self.scale), None, memory
+        return jnp.where(memory < 10, ctrl, jnp.nan), None, memory + 1
 
 
 def make_simulator(mjcf: str, candidates: Sequence[Effect] = ()):
