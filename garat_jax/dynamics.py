@@ -205,7 +205,7 @@ def move(
         return state._replace(memory=memory)
 
     def substep(state: PhysicsState, _):
-        tuned, command, force, memory = _act(dynamics, model, state, ctrl, state.memory)
+        tuned, command, force, memory = apply_effects(dynamics, model, state, ctrl, state.memory)
         now = _tuned(dynamics, constants, model, tuned)
         state = _advance(dynamics, now, state, command[None], force[None], 1)
         return state._replace(memory=memory), None
@@ -246,7 +246,7 @@ def lead(
 
     def substep(memory, place):
         now = state._replace(qpos=place[0], qvel=place[1])
-        *_, memory = _act(dynamics, model, now, ctrl, memory)
+        *_, memory = apply_effects(dynamics, model, now, ctrl, memory)
         return memory, None
 
     memory, _ = jax.lax.scan(substep, state.memory, (qpos, qvel))
@@ -301,7 +301,7 @@ def trajectory(
         return memory, tuple(results)
 
     def without_memory(command, force, seen):
-        _, command, more, _ = _act(then, model, look(seen), command, state.memory[count:])
+        _, command, more, _ = apply_effects(then, model, look(seen), command, state.memory[count:])
         return command, force + more
 
     if count:
@@ -331,7 +331,7 @@ def note(dynamics: Dynamics, state: PhysicsState, seconds: float) -> PhysicsStat
 
 
 @full_precision
-def _act(dynamics: Dynamics, model: ModelView, state, ctrl, memories):
+def apply_effects(dynamics: Dynamics, model: ModelView, state, ctrl, memories):
     """Apply every effect once: model, command [nu], generalised force [nv], memories."""
     force = jnp.zeros(dynamics.host.model.nv, ctrl.dtype)
     updated = []
@@ -353,7 +353,7 @@ def _commands(dynamics: Dynamics, model: ModelView, seen, memory, ctrl, num_subs
         return ctrl[None], jnp.zeros((1, dynamics.host.model.nv), ctrl.dtype), memory
 
     def substep(memory, _):
-        _, command, force, memory = _act(dynamics, model, seen, ctrl, memory)
+        _, command, force, memory = apply_effects(dynamics, model, seen, ctrl, memory)
         return memory, (command, force)
 
     memory, (commands, forces) = jax.lax.scan(substep, memory, length=num_substeps)

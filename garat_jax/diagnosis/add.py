@@ -175,7 +175,8 @@ def size(
         UserError: Nothing is left to fit, or the recordings excite none of it.
     """
     recordings = thin(checked(recordings))
-    host = native_model(model.compile(engine="mujoco"))
+    world = model.compile(engine="mujoco")
+    host = native_model(world)
     grid = grid_for(recordings, host)
     simulator = Simulator(model, (effect,), grid)
     free = [j for j, slot in enumerate(simulator.slots) if slot.parameter.name not in given]
@@ -191,7 +192,7 @@ def size(
         segments,
         np.ones(len(segments.start), bool),
         grid.sample,
-        suggest((effect,), host, recordings),
+        suggest((effect,), host, recordings, world),
     )
     metric = make_metric(dataclasses.replace(problem, fitted=~problem.fitted))
     before = settle(problem, simulator.base, segments.start)

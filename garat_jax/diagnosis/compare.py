@@ -163,12 +163,13 @@ def compare(
     """
     started = time.monotonic()
     recordings = checked(recordings)
-    host = native_model(model.compile(engine="mujoco"))
+    world = model.compile(engine="mujoco")
+    host = native_model(world)
     for other in also:
         theirs = other.compile(engine="mujoco").host.model
         check_same_machine(other.path, theirs, model.path, host)
-    qualities = tuple(assess(r, host) for r in recordings)
-    torques = compare_torques(host, recordings)
+    qualities = tuple(assess(r, host, world) for r in recordings)
+    torques = compare_torques(host, recordings, world)
     recordings = thin(recordings)
     grid = grid_for(recordings, host)
     simulator = Simulator(model, (), grid)
@@ -198,7 +199,7 @@ def compare(
         error=error,
         horizon=stated,
         horizons=_at_horizons(played),
-        where=tuple(localise(missing_torque(host, recordings))),
+        where=tuple(localise(missing_torque(host, recordings, world))),
         residuals=examine(played[stated], recordings, element_names(host, "actuator")),
         torques=torques,
         recordings=qualities,

@@ -67,7 +67,8 @@ def diagnose(
     fitted, held_out, how = split(checked(recordings), checked(holdout, least=0))
     everything = thin((*fitted, *held_out))
     whole = dataclasses.replace(model, effects=(*model.effects, *shared))
-    host = native_model(whole.compile(engine="mujoco"))
+    world = whole.compile(engine="mujoco")
+    host = native_model(world)
     others = make_candidates(whole)
     grid = grid_for(everything, host)
     say("choosing the horizon")
@@ -78,7 +79,7 @@ def diagnose(
     warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
     warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, everything, grid, horizon)
-    suggested = suggest(simulator.effects, host, fitted)
+    suggested = suggest(simulator.effects, host, fitted, world)
     seen = segments.recording < len(fitted)
     problem = Problem(simulator, segments, seen, grid.sample, suggested)
     say("the model as it is")
@@ -104,7 +105,7 @@ def diagnose(
         verdict=verdict_of(outcome.adequate, outcome.selected, error, longest),
         error=error,
         longest=longest,
-        where=tuple(localise(missing_torque(host, everything))),
+        where=tuple(localise(missing_torque(host, everything, world))),
         candidates=outcome.candidates,
         selected=outcome.selected,
         ladder=_ladder(problem, outcome),

@@ -5,9 +5,12 @@ actuators give, both smoothed by the same filter. It is a second view, independe
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from scipy import signal
@@ -15,6 +18,7 @@ from scipy import signal
 from garat_jax.diagnosis.activation import LONGEST, follow_commands, forgets_in, known_spans
 from garat_jax.diagnosis.columns import signals, torques
 from garat_jax.diagnosis.filters import even_steps, held, interpolated
+from garat_jax.dynamics import Dynamics, apply_effects, initial_state, view
 from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
 from garat_jax.effects.gear import gear_of
 from garat_jax.effects.units import at_slide
@@ -89,16 +93,19 @@ class MissingTorque(NamedTuple):
     limited: np.ndarray
 
 
-def missing_torque(model: mujoco.MjModel, recordings: "Sequence[Recording]") -> MissingTorque:
+def missing_torque(
+    model: mujoco.MjModel, recordings: "Sequence[Recording]", world: Dynamics | None = None
+) -> MissingTorque:
     """Compute the torque that a model lacks along the recordings.
 
     Args:
         model: The compiled model, its native fields as its effects leave them.
         recordings: What was measured.
+        world: The same with its effects, whose commands and forces count as the model's.
     """
     activations = [_activations(model, recording) for recording in recordings]
     parts = [
-        _of_span(model, r, act, slice(*span))
+        _of_span(model, r, act, slice(*span), world)
         for r, act in zip(recordings, activations, strict=True)
         for span in known_spans(r, forgets_in(model)) or r.spans
     ]
@@ -190,7 +197,42 @@ def _activations(model: mujoco.MjModel, recording: "Recording") -> np.ndarray:
     return interpolated(at, steps, followed)
 
 
-def _of_span(model: mujoco.MjModel, recording: "Recording", activations: np.ndarray, span: slice):
+def _of_effects(world: Dynamics | None, time: np.ndarray, qpos, qvel, ctrl):
+    """Return commands [T, nu] as effects leave them, and their forces [T, nv], at even times."""
+    if world is None or not any(effect.acts for effect in world.effects):
+        return ctrl, np.zeros_like(qvel)
+    substeps = max(1, round(float(np.median(np.diff(time))) / world.timestep))
+    inputs = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel, ctrl))
+    sent, force = _acting(world, *inputs, substeps)
+    return np.asarray(sent, float), np.asarray(force, float)
+
+
+@functools.partial(jax.jit, static_argnums=4)
+def _acting(world: Dynamics, qpos, qvel, ctrl, substeps: int):
+    """Return the means over each sample's substeps of commands [T, nu] and forces [T, nv]."""
+    model, state = view(world), initial_state(world, qpos[0], qvel[0])
+
+    def sample(memory, inputs):
+        qpos, qvel, command = inputs
+        seen = state._replace(qpos=qpos, qvel=qvel)
+
+        def substep(memory, _):
+            _, sent, force, memory = apply_effects(world, model, seen, command, memory)
+            return memory, (sent, force)
+
+        memory, (sent, force) = jax.lax.scan(substep, memory, length=substeps)
+        return memory, (sent.mean(axis=0), force.mean(axis=0))
+
+    return jax.lax.scan(sample, state.memory, (qpos, qvel, ctrl))[1]
+
+
+def _of_span(
+    model: mujoco.MjModel,
+    recording: "Recording",
+    activations: np.ndarray,
+    span: slice,
+    world: Dynamics | None,
+):
     """Return the columns of `MissingTorque` for one span of one recording, at even steps."""
     sampled = recording.time[span]
     time = even_steps(sampled)
@@ -203,14 +245,15 @@ def _of_span(model: mujoco.MjModel, recording: "Recording", activations: np.ndar
     acceleration = signal.savgol_filter(velocity, size, 2, deriv=1, delta=interval, axis=0)
     speed = signal.savgol_filter(velocity, size, 2, axis=0)
     low, high = model.actuator_forcerange.T
+    sent, force = _of_effects(world, time, qpos, speed, ctrl)
     data = mujoco.MjData(model)
     gears = np.asarray([gear_of(model, actuator) for actuator in range(model.nu)])
     rows = []
     for k in range(len(time)):
         data.qpos[:], data.qvel[:] = qpos[k], speed[k]
-        data.qacc[:], data.ctrl[:], data.act[:] = acceleration[k], ctrl[k], act[k]
+        data.qacc[:], data.ctrl[:], data.act[:] = acceleration[k], sent[k], act[k]
         mujoco.mj_inverse(model, data)
-        needed, load = data.qfrc_inverse.copy(), data.qfrc_bias.copy()
+        needed, load = data.qfrc_inverse - force[k], data.qfrc_bias.copy()
         contact = _contact_torque(model, data)
         mujoco.mj_fwdActuation(model, data)
         drive = data.actuator_force * gears

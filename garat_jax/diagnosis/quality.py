@@ -16,6 +16,7 @@ from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.filters import even_steps, held, held_means, quantum
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque, window_size
 from garat_jax.diagnosis.measurements import Recording, noise
+from garat_jax.dynamics import Dynamics
 from garat_jax.effects.elements import element_names
 
 LAGS = np.arange(-0.02, 0.1001, 0.0005)
@@ -71,8 +72,8 @@ class Quality:
     warnings: tuple[str, ...]
 
 
-def assess(recording: Recording, model: mujoco.MjModel) -> Quality:
-    """Assess one recording of a model."""
+def assess(recording: Recording, model: mujoco.MjModel, world: Dynamics | None = None) -> Quality:
+    """Assess one recording of a model, `world` with its effects; see `missing_torque`."""
     intervals = np.concatenate([np.diff(recording.time[a:b]) for a, b in recording.spans])
     usual = float(np.median(intervals))
     return Quality(
@@ -84,7 +85,7 @@ def assess(recording: Recording, model: mujoco.MjModel) -> Quality:
         gaps=len(recording.spans) - 1,
         velocity="measured" if recording.velocity_measured else "estimated",
         channels=_channels(recording, model),
-        command_lag=command_lags(recording, model),
+        command_lag=command_lags(recording, model, world),
         warnings=recording.warnings,
     )
 
@@ -100,7 +101,9 @@ def _channels(recording: Recording, model: mujoco.MjModel) -> dict[str, Channel]
     }
 
 
-def command_lags(recording: Recording, model: mujoco.MjModel) -> dict[str, float]:
+def command_lags(
+    recording: Recording, model: mujoco.MjModel, world: Dynamics | None = None
+) -> dict[str, float]:
     """Estimate how late each actuator's command acts, in seconds; NaN where it does not show.
 
     The needed torque is regressed on the command of d seconds before, beside speed, its sign,
@@ -111,7 +114,7 @@ def command_lags(recording: Recording, model: mujoco.MjModel) -> dict[str, float
     gains = torque_per_command(model)
     lags = dict.fromkeys(names, float("nan"))
     spans = [dataclasses.replace(recording, spans=(span,)) for span in recording.spans]
-    missing = [(part, missing_torque(model, [part])) for part in spans]
+    missing = [(part, missing_torque(model, [part], world)) for part in spans]
     for index, name in enumerate(names):
         dof = int(np.argmax(np.abs(gains[:, index]))) if model.nv else 0
         if gains[dof, index] != 0.0:

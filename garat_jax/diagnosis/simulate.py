@@ -150,7 +150,8 @@ class Simulator:
             segments: Commands and sample times.
 
         Returns:
-            Predictions, [P, S, L, num_signals]; not finite where a simulation diverged.
+            Predictions, [P, S, L, num_signals]; not finite where a simulation diverged, but for
+            padding: beyond a recording's end that says nothing.
         """
         result = np.empty((len(theta), *segments.measured.shape))
         at_once = np.asarray([self._is_at_once(row) for row in theta], bool)
@@ -158,7 +159,8 @@ class Simulator:
             if len(rows):
                 run = self._program(self._acting(theta[rows]))
                 result[rows] = self._in_batches(run, segments, theta[rows], start[rows])[0]
-        return result
+        is_told = (segments.weight[..., None] > 0) | np.isfinite(result)
+        return np.where(is_told, result, segments.measured)
 
     def linear_change(
         self, theta: np.ndarray, base: np.ndarray, start: np.ndarray, segments: Segments

@@ -9,6 +9,7 @@ import numpy as np
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.robust import orthonormal, without
+from garat_jax.dynamics import Dynamics
 from garat_jax.effects import Effect, Suggestion
 from garat_jax.effects.most import follow_most
 
@@ -19,14 +20,18 @@ UNTOUCHED = 0.2
 
 
 def suggest(
-    effects: Sequence[Effect], host: mujoco.MjModel, recordings: Sequence[Recording]
+    effects: Sequence[Effect],
+    host: mujoco.MjModel,
+    recordings: Sequence[Recording],
+    world: Dynamics | None = None,
 ) -> dict[int, Suggestion]:
     """Ask each effect at a hinge, slide or actuator what was missing or asked for there.
 
     Args:
         effects: The candidates.
-        host: The compiled model as it is; what acts on its commands, or by forces, is not in it.
+        host: The compiled model as it is.
         recordings: What was measured.
+        world: The same with its effects; see `missing_torque`.
 
     Returns:
         Suggestions by the effect's index.
@@ -34,7 +39,7 @@ def suggest(
     asked = {index: effect for index, effect in enumerate(effects) if _may_answer(effect)}
     if not asked:
         return {}
-    missing = missing_torque(host, recordings)
+    missing = missing_torque(host, recordings, world)
     torques = functools.cache(lambda dof: (_without_friction(missing, dof), _ripples(missing, dof)))
     answers = {index: _suggestion(effect, missing, torques) for index, effect in asked.items()}
     return {index: answer for index, answer in answers.items() if answer is not None}

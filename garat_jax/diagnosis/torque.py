@@ -15,6 +15,7 @@ from garat_jax.diagnosis.columns import torques
 from garat_jax.diagnosis.filters import even_steps
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque, window_size
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.dynamics import Dynamics
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,13 +52,14 @@ class TorqueError:
 
 
 def compare_torques(
-    model: mujoco.MjModel, recordings: Sequence[Recording]
+    model: mujoco.MjModel, recordings: Sequence[Recording], world: Dynamics | None = None
 ) -> tuple[TorqueError, ...]:
     """Compare every measured torque with the model's, smoothed alike; empty without any.
 
     Args:
         model: The compiled model, native fields as its effects leave them.
         recordings: What was measured.
+        world: The same with its effects; see `missing_torque`.
     """
     spans = [
         dataclasses.replace(recording, spans=(span,))
@@ -65,7 +67,7 @@ def compare_torques(
         if recording.torque
         for span in recording.spans
     ]
-    missing = [(span, missing_torque(model, [span])) for span in spans]
+    missing = [(span, missing_torque(model, [span], world)) for span in spans]
     found = []
     for dof, (name, unit) in enumerate(torques(model)):
         joint = name.partition(".")[2]

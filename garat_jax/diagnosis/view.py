@@ -74,7 +74,8 @@ def look(
         selected: The effects that a diagnosis found.
     """
     recordings = thin(recordings)
-    host = native_model(model.compile(engine="mujoco"))
+    world = model.compile(engine="mujoco")
+    host = native_model(world)
     horizons = lasting_horizons(recordings) or [longest_span(recordings)]
     before = replay(model, recordings, dict.fromkeys(horizons, shown))
     after, explained = (), None
@@ -82,6 +83,6 @@ def look(
         wanted = dict.fromkeys(horizons, shown) | {horizons[-1]: range(len(recordings))}
         *after, whole = replay(repaired(model, selected), recordings, wanted)
         after = (*after, whole.only(shown))
-        explained = missing_torque(host, as_recordings(whole, recordings, host))
-    missing = missing_torque(host, recordings)
+        explained = missing_torque(host, as_recordings(whole, recordings, host), world)
+    missing = missing_torque(host, recordings, world)
     return View(recordings, shown, before, after, missing, explained, host)

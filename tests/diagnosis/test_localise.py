@@ -1,11 +1,15 @@
 """The where-it-fails map: every regime that is hidden is named, in the units of the joint."""
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from garat_jax.diagnosis.localise import MUCH, MissingTorque, localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.dynamics import compile, initial_state, native_model, step
+from garat_jax.effects import ActuatorDelay, QuadraticDrag
 from tests import models
 
 TIME = np.linspace(0.0, 10.0, 2001)
@@ -106,6 +110,27 @@ def test_few_samples_have_a_place_too():
     missing = missing_torque(model, [Recording("a", np.arange(21) * 1e-3, *rest)])
     assert len(missing.time) == 1
     assert all(np.isfinite(place.share) for place in localise(missing))
+
+
+def test_what_effects_of_the_model_give_is_not_missing():
+    """Drag is a force and late commands are commands: no field of the compiled model has them."""
+    effects = (QuadraticDrag("joint/hinge", 0.2), ActuatorDelay("actuator/motor", 0.02))
+    spec = models.spec(models.PENDULUM)
+    spec.option.timestep = 0.001
+    world = compile(spec, (), effects, "mujoco")
+    ctrl = np.sign(np.sin(9 * np.arange(1000) * 0.002))[:, None]
+    state = initial_state(world, jnp.asarray([0.5]), jnp.zeros(1))
+
+    def advance(state, command):
+        return step(world, state, command, 2), jnp.concatenate([state.qpos, state.qvel])
+
+    path = jax.lax.scan(advance, state, jnp.asarray(ctrl, jnp.float32))[1]
+    qpos, qvel = np.split(np.asarray(path, float), 2, axis=1)
+    rest = (ctrl, {}, True, ((0, 1000),), ())
+    made = Recording("made", np.arange(1000) * 0.002, qpos, qvel, *rest)
+    host = native_model(world)
+    there, gone = (missing_torque(host, [made], w).torque for w in (world, None))
+    assert np.sqrt(np.mean(there**2)) < 0.15 * np.sqrt(np.mean(gone**2))
 
 
 def test_a_place_names_the_direction_of_a_joint_that_has_several():

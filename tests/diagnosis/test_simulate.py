@@ -112,6 +112,14 @@ def test_beside_a_law_that_looks_what_does_not_look_shares_a_program():
     assert np.abs(together - np.stack(alone)).max() < 1e-9
 
 
+def test_beyond_the_end_of_a_recording_a_model_may_diverge():
+    simulator, segments = make_simulator(models.PENDULUM, (Broken("actuator/motor"),))
+    segments.weight[0, 3:] = 0.0
+    predicted = simulator.predict(np.asarray([[0.9]]), segments.start[None], segments)[0]
+    np.testing.assert_array_equal(predicted[0, 3:], segments.measured[0, 3:])
+    assert np.isnan(predicted[0, 1:3]).all() and np.isnan(predicted[1, 1:]).all()
+
+
 def test_an_effect_that_breaks_the_model_at_its_nominal_is_named():
     effects = (MotorGain("actuator/shoulder"), Broken("actuator/elbow"))
     simulator, segments = make_simulator(models.ARM, effects)
