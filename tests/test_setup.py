@@ -66,7 +66,7 @@ def test_what_the_project_asks_for_is_locked_to_a_version_that_it_accepts(line):
 
 def test_no_dependency_is_bound_to_an_address():
     extras = PROJECT["optional-dependencies"]
-    assert {"cuda", "workbench", "bench", "dev"} <= extras.keys()
+    assert {"cuda", "logs", "bench", "dev"} <= extras.keys()
     for line in [*PROJECT["dependencies"], *(line for lines in extras.values() for line in lines)]:
         assert Requirement(line).url is None
 

@@ -47,8 +47,9 @@ def try_own(
                 alone = compile(spec, overrides, (effect,), "mujoco")
             except UserError:
                 continue  # it may need another effect; compiling all of them says what is amiss
-            jax.eval_shape(_check_shapes, alone)
-            jax.eval_shape(_one_step, alone)
+            # Functions of their own: JAX would take a law that was read anew for the one before.
+            jax.eval_shape(lambda world: _check_shapes(world), alone)
+            jax.eval_shape(lambda world: _one_step(world), alone)
             check_identity(spec, type(effect), effect.target)
 
 

@@ -118,6 +118,7 @@ def test_each_condition_is_simulated_with_what_is_shared_and_what_is_its_own():
                 "past",
                 "past_qvel",
                 "num_past",
+                "begins",
             ),
             many,
         ),
