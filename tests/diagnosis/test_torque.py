@@ -99,9 +99,9 @@ def test_the_motion_is_inverted_once_a_span(monkeypatch):
     parts = dataclasses.replace(whole, spans=((0, 250), (250, 500)))
     computed = []
 
-    def counted(model, recordings):
+    def counted(model, recordings, world):
         computed.extend(span for recording in recordings for span in recording.spans)
-        return missing_torque(model, recordings)
+        return missing_torque(model, recordings, world)
 
     missing_torque = module.missing_torque
     monkeypatch.setattr(module, "missing_torque", counted)
