@@ -21,6 +21,7 @@ from garat_jax.diagnosis.horizon import (
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.model_card import Model, make_effect
+from garat_jax.diagnosis.own_effects import try_own
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.segments import grid_for
 from garat_jax.diagnosis.simulate import Simulator
@@ -141,8 +142,8 @@ def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, flo
     Parameters that are not given mean "no effect": what stands for a number of the model keeps it.
 
     Raises:
-        UserError: The kind, the target or a parameter is unknown, a value is outside its bounds, or
-            the model has this effect already.
+        UserError: The kind, the target or a parameter is unknown, a value is outside its bounds,
+            the model has this effect already, or a user's own law fails; see `try_own`.
     """
     cls = choose_kind(kind, model.catalogue)
     effect = make_effect(cls, target, values)
@@ -150,6 +151,7 @@ def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, flo
     effect.check(host)
     effect = effect.replace(**{**cls.at(host, target), **values})
     check_bounds(effect, host)
+    try_own(model.spec, model.overrides, (effect,))
     if (kind, target) in [(e.kind, e.target) for e in model.effects]:
         raise UserError(f"{model.path} has {kind} at {target} already; change it there")
     return effect
