@@ -89,12 +89,12 @@ def _check_spelling(arguments: Sequence[str], commands: Mapping[str, type]) -> N
         raise unknown_name("option", name, ["--help", "--version"])
     if name not in commands:
         raise unknown_name("command", name, commands)
-    known = [*_options(commands[name]), "--help"]
+    options = _options(commands[name])
     for argument in rest:
         is_option = argument.startswith("--") and argument not in HELP
-        if is_option and _option_in(argument) not in known[:-1]:
+        if is_option and _option_in(argument) not in options:
             option = argument.partition("=")[0]
-            raise unknown_name(f"option of {PROGRAM} {name}", option, known)
+            raise unknown_name(f"option of {PROGRAM} {name}", option, [*options, "--help"])
 
 
 def _options(command: type) -> dict[str, Any]:
@@ -149,21 +149,14 @@ def _gathered(words: Sequence[str], command: type) -> list[str]:
         for each in values:
             _check_number(name, each, options[name])
         given.setdefault(name, []).extend(values)
-    _check_positionals(positionals, command, any(len(v) > 1 for v in given.values()))
+    fields = [f for f in dataclasses.fields(command) if _option_named(f.name) not in options]
+    needed = [f.name.upper() for f in fields if f.default is dataclasses.MISSING]
+    if missing := needed[len(positionals) :]:
+        have_taken = any(len(values) > 1 for values in given.values())
+        hint = "; an option that takes several values takes all words up to the next option: put "
+        hint = f"{hint}{missing[0]} before it" if have_taken else ""
+        raise UserError(f"missing: {', '.join(missing)}{hint}")
     return [*positionals, *itertools.chain(*([name, *values] for name, values in given.items()))]
-
-
-def _check_positionals(words: Sequence[str], command: type, have_taken: bool) -> None:
-    """Refuse too few of them; say where they may be if options have taken several words."""
-    fields = dataclasses.fields(command)
-    needed = [f.name for f in fields if f.default is dataclasses.MISSING]
-    positionals = [name for name in needed if _option_named(name) not in _options(command)]
-    if missing := [name.upper() for name in positionals[len(words) :]]:
-        hint = (
-            "; an option that takes several values takes all words up to the next option: "
-            f"put {missing[0]} before it"
-        )
-        raise UserError(f"missing: {', '.join(missing)}{hint if have_taken else ''}")
 
 
 def _num_values(hint: Any) -> int | None:

@@ -230,11 +230,11 @@ def _split(path: Path, time: np.ndarray) -> tuple[tuple[tuple[int, int], ...], l
     where = ", ".join(f"{time[gap] - time[0]:.6g}" for gap in gaps[:5])
     where += ", ..." if len(gaps) > 5 else ""
     dropped = len(time) - sum(b - a for a, b in spans)
-    parts = f"{len(spans)} part{'s' if len(spans) > 1 else ''}"
+    into = f"{len(spans)} part{'s' if len(spans) > 1 else ''}"
     lost = f"; {dropped} samples in shorter parts are left out" if dropped else ""
     return spans, [
         f"{path.name}: {len(gaps)} gap{'s' if len(gaps) > 1 else ''} ({where} s after the start, "
-        f"usual step {usual:g} s); split there into {parts}{lost}"
+        f"usual step {usual:g} s); split there into {into}{lost}"
     ]
 
 

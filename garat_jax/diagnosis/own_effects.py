@@ -16,6 +16,7 @@ from garat_jax.dynamics import Dynamics, PhysicsState, compile, initial_state, s
 from garat_jax.effects import CATALOGUE, Effect
 from garat_jax.effects.base import ModelView
 from garat_jax.effects.catalogue import line_in
+from garat_jax.engine import HostModel
 from garat_jax.errors import UserError, nearest
 from garat_jax.overrides import Override
 
@@ -50,21 +51,27 @@ def try_own(
             # Functions of their own: JAX would take a law that was read anew for the one before.
             jax.eval_shape(lambda world: _check_shapes(world), alone)
             jax.eval_shape(lambda world: _one_step(world), alone)
-            check_identity(spec, type(effect), effect.target)
+            check_identity(alone.host, type(effect), effect.target)
 
 
 @functools.lru_cache(maxsize=1000)
-def check_identity(spec: mujoco.MjSpec, cls: type[Effect], target: str) -> None:
+def check_identity(compiled: HostModel, cls: type[Effect], target: str) -> None:
     """Refuse a law that changes something where its parameters mean "no effect".
 
     What `prepare` does, and to what it adds, is left to it.
 
+    Args:
+        compiled: A model that is compiled for the effect, with its overrides.
+        cls: The kind of effect.
+        target: Where it acts.
+
     Raises:
         UserError: It changes a field of the model, a command or a sensor, or adds a force.
     """
-    nominal = cls.at(spec.copy().compile(), target)
-    alone = compile(spec, (), (cls(target=target, **nominal),), "mujoco")
-    (effect,), host = alone.effects, alone.host.model
+    host = compiled.model
+    nominal = cls.at(host, target)
+    effect = cls(target=target, **{name: jnp.asarray(v) for name, v in nominal.items()})
+    alone = Dynamics((effect,), None, compiled, "mujoco")
     rng = np.random.default_rng(0)
     low, high = _command_range(host)
     ctrl = rng.uniform(low, high, (TRIALS, STEPS, host.nu))

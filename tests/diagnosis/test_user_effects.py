@@ -11,6 +11,7 @@ from garat_jax.diagnosis.add import add
 from garat_jax.diagnosis.diagnose import make_candidates
 from garat_jax.diagnosis.own_effects import check_identity
 from garat_jax.diagnosis.view import repaired
+from garat_jax.dynamics import Override, compile
 from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import load_catalogue
 from garat_jax.errors import UserError
@@ -186,7 +187,28 @@ def test_the_catalogue_passes_for_a_users_own(kind):
     targets = CATALOGUE[kind].targets(spec.copy().compile())
     assert targets
     for target in targets[:2]:
-        check_identity(spec, CATALOGUE[kind], target)
+        effect = CATALOGUE[kind](target=target)
+        check_identity(compile(spec, (), (effect,), "mujoco").host, CATALOGUE[kind], target)
+
+
+def test_a_law_is_tried_in_the_model_with_its_overrides(mine):
+    """It may need what the card overrides, whatever kind of value that has."""
+    needs = "    def check(self, host):\n        if not host.dof_armature.all():\n"
+    needs += '            raise UserError("needs an armature")\n\n    def fields'
+    law = MINE.replace("    def fields", needs).replace(
+        "import jax\n", "import jax\nfrom garat_jax.errors import UserError\n"
+    )
+    mine.write_text(law)
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    overrides = (
+        Override("joint", "hinge", "armature", 0.01),
+        Override("body", "pole", "pos", [0, 0, 2]),
+    )
+    there = dataclasses.replace(model, overrides=overrides)
+    effect = model.catalogue["my_spring"](target="joint/hinge")
+    assert there.compile(engine="mujoco", extra_effects=[effect]).effects[0].kind == "my_spring"
+    with pytest.raises(UserError, match="needs an armature"):
+        model.compile(engine="mujoco", extra_effects=[effect])
 
 
 @pytest.mark.parametrize(
