@@ -142,17 +142,15 @@ class HostModel:
         time than a dozen lines of Python.
         """
         rows, controls, *values = (np.ascontiguousarray(value).view(dtype) for value in words)
-        leading = np.broadcast_shapes(*(value.shape[:-1] for value in words))
+        leading = np.broadcast_shapes(*{value.shape[:-1] for value in words})
         num = math.prod(leading)
-        rows = np.broadcast_to(rows, leading + rows.shape[-1:]).reshape(num, -1)
-        controls = np.broadcast_to(controls, leading + controls.shape[-1:])
-        controls = controls.reshape(num, -1, self.model.nu + self.model.nv)
+        rows = _over(leading, rows).reshape(num, -1)
+        controls = _over(leading, controls).reshape(num, -1, self.model.nu + self.model.nv)
         with self._simulations(num, names) as simulations:
             simulations.write_fields(values, leading)
             simulations.state[:] = rows
-            finite = np.isfinite(rows)
-            ids = None if finite.all() else np.flatnonzero(finite.all(axis=1))
-            result = function(simulations, controls, ids)
+            finite = np.isfinite(rows).all(axis=1)
+            result = function(simulations, controls, None if finite.all() else finite)
             _log_warnings()
             if result.dtype != rows.dtype:
                 with np.errstate(over="ignore"):  # what exploded is infinite in 32 bits
@@ -160,18 +158,18 @@ class HostModel:
         return result.reshape(*leading, -1).view(np.uint32)
 
     def _advance_batch(
-        self, num_substeps: int, simulations: "_Simulations", controls: np.ndarray, ids
+        self, num_substeps: int, simulations: "_Simulations", controls: np.ndarray, finite
     ) -> np.ndarray:
         """Step a batch under controls [num, substeps or 1, nu + nv]; return its rows.
 
-        Simulations not in `ids`, unless that is None for all, stay as they are.
+        Simulations that are not `finite` [num] bool, None if all are, stay as they are.
         """
         if controls.shape[1] == 1:
             simulations.inputs[:] = controls[:, 0]
-            simulations.batch.step(ids, nstep=num_substeps)
+            simulations.batch.step(finite, nstep=num_substeps)
         else:
-            chosen = controls if ids is None else controls[ids]
-            simulations.batch.rollout(num_substeps, chosen, INPUTS, record=(), ids=ids)
+            chosen = controls if finite is None else controls[finite]
+            simulations.batch.rollout(num_substeps, chosen, INPUTS, record=(), ids=finite)
         return np.concatenate([simulations.state, simulations.sensors], axis=1)
 
     def _trace_batch(
@@ -180,19 +178,19 @@ class HostModel:
         repeat: int,
         simulations: "_Simulations",
         controls: np.ndarray,
-        ids,
+        finite,
     ) -> np.ndarray:
         """Step a batch under controls [num, .., nu + nv], each held for `repeat` substeps.
 
         MuJoCo stops a simulation that diverges and repeats its last state; here that is NaN.
         """
         batch, num, length = simulations.batch, len(controls), controls.shape[1] * repeat
-        chosen = np.repeat(controls if ids is None else controls[ids], repeat, axis=1)
+        chosen = np.repeat(controls if finite is None else controls[finite], repeat, axis=1)
         begin = simulations.state[:, 0].copy()
-        found = batch.rollout(length, chosen, INPUTS, record=("qpos", "qvel"), ids=ids)
+        found = batch.rollout(length, chosen, INPUTS, record=("qpos", "qvel"), ids=finite)
         moved = np.concatenate([found["qpos"], found["qvel"]], axis=2)
         path = np.full((num, length // num_substeps, moved.shape[2]), np.nan)
-        path[slice(None) if ids is None else ids] = moved[:, num_substeps - 1 :: num_substeps]
+        path[slice(None) if finite is None else finite] = moved[:, num_substeps - 1 :: num_substeps]
         done = (simulations.state[:, 0] - begin) / self.model.opt.timestep
         steps = num_substeps * np.arange(1, path.shape[1] + 1)
         path[~(done[:, None] > steps - 0.5)] = np.nan
@@ -238,12 +236,18 @@ class _Simulations:
         """Write the fields [.., n] and recompute what derives from those that changed."""
         stale = False
         for (name, held), value in zip(self.fields.items(), values, strict=True):
-            value = np.broadcast_to(value, leading + value.shape[-1:]).reshape(held.shape)
-            if not np.array_equal(held, value):
+            value = _over(leading, value).reshape(held.shape)
+            if (held != value).any():
                 held[...] = value
                 stale = stale or name in CONSTANT_INPUTS
         if stale:
             self.batch.set_const()
+
+
+def _over(leading: tuple[int, ...], value: np.ndarray) -> np.ndarray:
+    """Broadcast the leading axes of a value [.., n], which takes NumPy long where it has them."""
+    shape = leading + value.shape[-1:]
+    return value if value.shape == shape else np.broadcast_to(value, shape)
 
 
 def profiling_clock() -> ctypes.c_void_p | None:

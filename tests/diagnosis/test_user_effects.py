@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+from pathlib import Path
 
 import pytest
 
@@ -50,6 +51,12 @@ def mine(tmp_path):
     path.write_text(MINE)
     (tmp_path / "pendulum.xml").write_text(models.PENDULUM)
     return path
+
+
+def compile_with_spring(mine: Path, **sizes: float) -> None:
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    effect = model.catalogue["my_spring"](target="joint/hinge", **sizes)
+    model.compile(engine="mujoco", extra_effects=[effect])
 
 
 def test_it_is_a_candidate_at_every_joint(mine):
@@ -140,13 +147,11 @@ LAW = (
 )
 def test_what_a_law_returns_is_checked(mine, returned, sensed, said):
     mine.write_text(LAW.replace("RETURNED", returned).replace("SENSED", sensed))
-    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
-    effect = model.catalogue["my_spring"](target="joint/hinge", stiffness=1.0)
     if not said:
-        model.compile(engine="mujoco", extra_effects=[effect])
+        compile_with_spring(mine, stiffness=1.0)
         return
     with pytest.raises(UserError) as caught:
-        model.compile(engine="mujoco", extra_effects=[effect])
+        compile_with_spring(mine, stiffness=1.0)
     assert str(caught.value).startswith(f"effect my_spring ({mine} line ")
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
@@ -174,10 +179,8 @@ def test_what_a_law_returns_is_checked(mine, returned, sensed, said):
 def test_what_fields_returns_is_checked(mine, old, new, said):
     assert old in MINE
     mine.write_text(MINE.replace(old, new))
-    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
-    effect = model.catalogue["my_spring"](target="joint/hinge")
     with pytest.raises(UserError) as caught:
-        model.compile(engine="mujoco", extra_effects=[effect])
+        compile_with_spring(mine)
     assert f"({mine} line 21): " in str(caught.value) and said in str(caught.value)
 
 
