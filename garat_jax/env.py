@@ -120,8 +120,13 @@ class Env(abc.ABC):
         return self.action_low.shape[0]
 
     def clip(self, action: jax.Array) -> jax.Array:
-        """Return the action [action_size] within its bounds."""
-        return jnp.clip(action, self.action_low, self.action_high)
+        """Return the action [action_size] within its bounds.
+
+        JAX keeps an array that it met in a program, by its identity, in the precision of then:
+        these are new ones for each.
+        """
+        low, high = (np.array(x, action.dtype) for x in (self.action_low, self.action_high))
+        return jnp.clip(action, low, high)
 
     def features(self, obs: jax.Array) -> jax.Array:
         """Return what networks see of observations [..., obs_size], [..., features]."""

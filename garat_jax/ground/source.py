@@ -100,13 +100,13 @@ def load_grounded(
 
 def with_transformer(method, env: RecordedEnv, transformer):
     """Return `(state, command) -> command` in the precision that it is called with."""
-    params = jax.tree.map(
-        lambda x: np.asarray(x, float) if jnp.issubdtype(x.dtype, jnp.floating) else np.asarray(x),
-        transformer,
-    )
+    params = jax.tree.map(np.asarray, transformer)
 
     def transform(state: jax.Array, command: jax.Array) -> jax.Array:
+        def new(x: np.ndarray) -> np.ndarray:  # for each program, as in `Env.clip`
+            return np.array(x, state.dtype if np.issubdtype(x.dtype, np.floating) else x.dtype)
+
         key = jax.random.key(0)  # unused: a transformer's mean draws nothing
-        return env.clip(method.transform(params, state, env.clip(command), key))
+        return env.clip(method.transform(jax.tree.map(new, params), state, env.clip(command), key))
 
     return transform

@@ -19,16 +19,13 @@ from garat_jax.errors import UserError
 from garat_jax.ground import GroundConfig, ground, load_grounded
 from garat_jax.ground.learn import Best
 from garat_jax.ground.run import load_policy
-from garat_jax.ground.source import make_source
-from garat_jax.ground.steps import (
-    choose_bounds,
-    control_steps,
-)
+from garat_jax.ground.source import make_source, with_transformer
+from garat_jax.ground.steps import choose_bounds, control_steps, draw
+from garat_jax.methods.garat import GARATConfig
 from garat_jax.methods.gat import GATConfig
-from garat_jax.methods.recorded import (
-    needed_change,
-)
+from garat_jax.methods.recorded import as_transitions, clone, cloned, needed_change
 from garat_jax.runs import RunDirectory
+from garat_jax.transfer import make_method
 from tests import models
 from tests.probe_envs import Hang
 
@@ -233,6 +230,33 @@ def test_a_task_in_a_grounded_model_sends_what_the_transformer_makes(recorded, g
     )
     np.testing.assert_allclose(grounded_step.state.obs, step.state.obs, rtol=1e-6)
     np.testing.assert_allclose(grounded_step.reward, action[0])
+
+
+def test_a_model_that_was_compared_can_be_trained_in(recorded, grounded):
+    model, bare = load_grounded(grounded, {"gat": SMALL}), load_model(recorded[0])
+    compare(bare, read_recordings(bare, recorded[1][-1:]), also=[model])  # in double precision
+    world = model.world(hang(recorded[0]))
+    state = world.env.reset(world.params, jax.random.key(0))
+    step = jax.jit(world.env.step)(world.params, state, jnp.ones(1), jax.random.key(0))
+    assert step.state.obs.dtype == jnp.float32
+
+
+@pytest.mark.parametrize("learner", [SMALL.learner, GARATConfig(), GARATConfig(output="absolute")])
+def test_a_transformer_is_used_in_either_precision(read, learner):
+    model, recordings = read
+    bounds = choose_bounds(model, recordings)
+    steps = draw(control_steps(recordings, bounds.interval), 20, np.random.default_rng(0))
+    env, world = make_source(model, steps.state, np.zeros(2), bounds, episode=0.1)
+    method = make_method(env, cloned(env), learner)
+    learned = method.init(
+        jax.random.key(0), world, clone(env, steps), as_transitions(env, steps)
+    ).transformer.policy
+    transform = with_transformer(method, env, learned)
+    with jax.enable_x64(True):
+        double = jax.jit(transform)(jnp.full(2, 0.1), jnp.full(1, 0.2))
+    single = jax.jit(transform)(jnp.full(2, 0.1), jnp.full(1, 0.2))
+    assert (double.dtype, single.dtype) == (jnp.float64, jnp.float32)
+    np.testing.assert_allclose(single, double, rtol=1e-5)
 
 
 def test_a_task_with_other_control_steps_is_refused(recorded, grounded):
