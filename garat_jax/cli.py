@@ -1,7 +1,8 @@
 """The command `garat`: reads the arguments, makes the run directory, hands over to the library.
 
 Each command is a frozen dataclass: its docstrings are the help, its `run` does the work. Imports of
-anything that loads JAX stand inside `run`, so that help and errors come at once.
+anything that loads JAX stand inside `run`, so that help and what is wrong with options come at
+once.
 """
 
 import dataclasses
@@ -173,8 +174,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command line without the program's name; that of the process if None.
 
     Returns:
-        0 done, 1 a computation diverged, 2 the user's input is wrong, 130 interrupted. Anything
-        else is a fault of the program and leaves as an exception.
+        0 done, 1 a computation diverged, 2 the user's input is wrong, 130 interrupted by Ctrl-C
+        or SIGTERM. Anything else is a fault of the program and leaves as an exception.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     compilation_cache.enable()

@@ -2,13 +2,18 @@
 
 import os
 import resource
+import socket
 import sys
+import time
 import traceback
 from typing import Any
 
 import jax
 
 from garat_jax.errors import UserError
+
+PATIENCE = 300.0
+"""Seconds to wait for process 0, as long as JAX does."""
 
 
 def num_cores() -> int:
@@ -76,11 +81,15 @@ def join_processes(
         UserError: The processes do not come together, or as `use`.
     """
     _prefer(device)
+    # It would take SIGTERM, for those who ask it; here Python's handler ends the run.
+    jax.config.update("jax_enable_preemption_service", False)
+    address = coordinator or os.environ.get("JAX_COORDINATOR_ADDRESS")
     try:
+        number = _or_variable(process, "JAX_PROCESS_ID")
+        if address:
+            _check_address(address, wait=bool(number))
         jax.distributed.initialize(
-            coordinator,
-            _or_variable(num_processes, "JAX_NUM_PROCESSES"),
-            _or_variable(process, "JAX_PROCESS_ID"),
+            coordinator, _or_variable(num_processes, "JAX_NUM_PROCESSES"), number
         )
     except (RuntimeError, ValueError) as error:
         raise UserError(
@@ -89,6 +98,27 @@ def join_processes(
         ) from error
     use(device)
     return jax.process_index()
+
+
+def _check_address(address: str, wait: bool) -> None:
+    """Refuse an address for which JAX would end the process: no address, or nobody there.
+
+    Args:
+        address: Of process 0.
+        wait: Wait until somebody answers.
+    """
+    host, _, port = address.rpartition(":")
+    if not host or not (port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
+        raise UserError(f"the coordinator is {address!r}; expected HOST:PORT, as node1:1234")
+    last = time.monotonic() + PATIENCE
+    while wait:
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=PATIENCE).close()
+            return
+        except OSError as error:
+            if time.monotonic() > last:
+                raise UserError(f"no process 0 answers at {address}: {error}") from error
+            time.sleep(1.0)
 
 
 def _or_variable(number: int | None, variable: str) -> int | None:

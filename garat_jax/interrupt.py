@@ -1,4 +1,6 @@
-"""Ctrl-C at a moment that the program can stand.
+"""Ctrl-C, or a request to terminate, at a moment that the program can stand.
+
+SIGTERM, which batch systems and containers send before they kill, counts as Ctrl-C.
 
 Python raises KeyboardInterrupt wherever the main thread happens to be. While XLA runs a program,
 that may be in a Python function which C entered (host_call.py): what is raised at its first line
@@ -14,6 +16,9 @@ from types import CodeType, FrameType
 from typing import TypeVar
 
 Function = TypeVar("Function", bound=Callable)
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""What ends a program that may still put its files in order."""
 
 _entered_from_c: set[CodeType] = set()
 _held = threading.Event()
@@ -77,13 +82,14 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Handle Ctrl-C; not where it is ignored, as in a script's background, nor in a thread."""
-    is_main = threading.current_thread() is threading.main_thread()
-    previous = signal.getsignal(signal.SIGINT)
-    if not is_main or previous in (signal.SIG_IGN, None):
+    """Handle signals; none that is ignored, as in a script's background, and none in a thread."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    signal.signal(signal.SIGINT, handler)
+    previous = {number: signal.getsignal(number) for number in SIGNALS}
+    previous = {n: old for n, old in previous.items() if old not in (signal.SIG_IGN, None)}
+    for number in previous:
+        signal.signal(number, handler)
     try:
         yield
         raise_held()
@@ -92,5 +98,6 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[No
             raise
         raise KeyboardInterrupt from error
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, old in previous.items():
+            signal.signal(number, old)
         _held.clear()

@@ -278,14 +278,11 @@ def earlier_run_kept(root: Path) -> Iterator[None]:
         UserError: The folder holds something else than a run, or the current folder is within it.
     """
     root = Path(os.path.abspath(root))  # `.` has no name
-    aside = root.parent / f".{root.name}.replaced"
-    if aside.exists() and not root.exists():  # a process was killed before it put it back
-        aside.rename(root)
+    aside = _aside(root)
     if not _is_occupied(root):
         yield
         return
     _check_replaceable(root)
-    shutil.rmtree(aside, ignore_errors=True)
     root.rename(aside)
     try:
         yield
@@ -299,6 +296,30 @@ def earlier_run_kept(root: Path) -> Iterator[None]:
         else:
             shutil.rmtree(root, ignore_errors=True)
             aside.rename(root)
+
+
+def put_back_earlier(root: Path) -> None:
+    """Do what a process that was killed could not: put the run back that it was to replace.
+
+    Where it had results, the run that they replaced goes.
+
+    Args:
+        root: The folder of the run.
+    """
+    root = Path(os.path.abspath(root))
+    aside = _aside(root)
+    if not aside.exists():
+        return
+    if is_run(root) and _holds_results(root):
+        shutil.rmtree(aside)
+    elif is_run(root) or not _is_occupied(root):
+        shutil.rmtree(root, ignore_errors=True)
+        aside.rename(root)
+
+
+def _aside(root: Path) -> Path:
+    """Return where a run is until another one has results in its place."""
+    return root.parent / f".{root.name}.replaced"
 
 
 def _holds_results(root: Path) -> bool:

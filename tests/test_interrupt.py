@@ -6,8 +6,8 @@ import pytest
 from garat_jax.interrupt import deferred_interrupt, entered_from_c, interruptible, raise_held
 
 
-def press():
-    os.kill(os.getpid(), signal.SIGINT)
+def press(number=signal.SIGINT):
+    os.kill(os.getpid(), number)
 
 
 def test_an_interrupt_waits_for_the_end_of_the_block():
@@ -33,10 +33,13 @@ def test_without_an_interrupt_nothing_happens_and_the_handler_is_back():
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_an_interrupt_ends_a_block():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_a_block(number):
+    before = signal.getsignal(number)
     with pytest.raises(KeyboardInterrupt), interruptible():
-        press()
+        press(number)
         pytest.fail("it went on")
+    assert signal.getsignal(number) is before
 
 
 @pytest.mark.parametrize("block", [interruptible, deferred_interrupt])

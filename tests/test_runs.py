@@ -8,7 +8,7 @@ import pytest
 
 from garat_jax.errors import UserError
 from garat_jax.provenance import git_state, provenance
-from garat_jax.runs import RunDirectory, earlier_run_kept, to_plain
+from garat_jax.runs import RunDirectory, earlier_run_kept, put_back_earlier, to_plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,9 +82,35 @@ def test_the_current_folder_may_be_named_by_a_dot(tmp_path, monkeypatch):
 
 def test_an_earlier_run_that_a_killed_process_put_aside_comes_back(tmp_path):
     create(tmp_path / ".run.replaced").log(1, loss=1.0)
-    with pytest.raises(UserError), earlier_run_kept(tmp_path / "run"):
-        raise UserError("wrong input")
+    put_back_earlier(tmp_path / "run")
     assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_earlier_run_comes_back_where_a_killed_process_had_no_results(tmp_path):
+    create(tmp_path / ".run.replaced").log(1, loss=1.0)
+    create(tmp_path / "run", seeds=[7])
+    put_back_earlier(tmp_path / "run")
+    assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_earlier_run_goes_where_a_killed_process_had_results(tmp_path):
+    create(tmp_path / ".run.replaced").log(1, loss=1.0)
+    create(tmp_path / "run", seeds=[7]).log(2, loss=3.0)
+    put_back_earlier(tmp_path / "run")
+    run = RunDirectory.open(tmp_path / "run")
+    assert run.read_json("config.json")["seeds"] == [7]
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_what_a_killed_process_left_beside_other_files_stays(tmp_path):
+    create(tmp_path / ".run.replaced").log(1, loss=1.0)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("years of work")
+    put_back_earlier(tmp_path / "run")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".run.replaced", "run"]
+    assert (tmp_path / "run" / "thesis.tex").exists()
 
 
 def test_force_replaces_a_run(tmp_path):

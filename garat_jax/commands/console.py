@@ -63,7 +63,7 @@ def make_run(
     Raises:
         UserError: A seed is out of range, or the folder may not be written.
     """
-    from garat_jax.runs import RunDirectory, earlier_run_kept
+    from garat_jax.runs import RunDirectory, earlier_run_kept, put_back_earlier
 
     for seed in seeds:
         if not 0 <= seed <= LARGEST_SEED:
@@ -75,6 +75,8 @@ def make_run(
     }
     line = shlex.join([PROGRAM, *sys.argv[1:]])
     replaces = command.force and not resume
+    if command.force or resume:
+        put_back_earlier(out)
     if replaces:
         _check_outside(command, out)
     with earlier_run_kept(out) if replaces else contextlib.nullcontext():

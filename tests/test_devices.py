@@ -1,0 +1,28 @@
+import socket
+
+import pytest
+
+from garat_jax import devices
+from garat_jax.errors import UserError
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["nonsense", "localhost:", "localhost:abc", "localhost:99999999", "localhost:0", ":1234"],
+)
+def test_an_address_that_is_none_is_refused(address, monkeypatch):
+    message = "expected HOST:PORT, as node1:1234"
+    with pytest.raises(UserError, match=message):
+        devices.join_processes(address, 1, 0)
+    monkeypatch.setenv("JAX_COORDINATOR_ADDRESS", address)
+    with pytest.raises(UserError, match=message):
+        devices.join_processes(None, 1, 0)
+
+
+def test_a_process_0_that_never_answers_is_named(monkeypatch):
+    monkeypatch.setattr(devices, "PATIENCE", 0.1)
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))  # and does not listen
+        address = f"127.0.0.1:{unused.getsockname()[1]}"
+        with pytest.raises(UserError, match=f"no process 0 answers at {address}"):
+            devices.join_processes(address, 2, 1)
