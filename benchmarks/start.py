@@ -18,7 +18,7 @@ import tyro
 from record import write_result
 
 PAIR = "inverted_pendulum_heavy"
-PROGRAM = "import sys; from garat_jax.cli import main; sys.exit(main())"
+PROGRAM = "from garat_jax.cli import entry; entry()"
 LIMIT = 600.0
 
 

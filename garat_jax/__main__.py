@@ -1,7 +1,5 @@
 """`python -m garat_jax` is `garat`."""
 
-import sys
+from garat_jax.cli import entry
 
-from garat_jax.cli import main
-
-sys.exit(main())
+entry()

@@ -7,10 +7,11 @@ once.
 
 import dataclasses
 import inspect
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, NoReturn, Protocol
 
 from tyro.conf import Positional
 
@@ -165,6 +166,16 @@ COMMANDS: dict[str, type[Command]] = {
     "list": List,
     "doctor": Doctor,
 }
+
+
+def entry() -> NoReturn:
+    """Run `garat` as the process that this is."""
+    status = main()
+    if status == INTERRUPTED:  # XLA's threads may still call Python, which would no longer be there
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -105,9 +105,10 @@ def compile(
         effect.unlock(spec)
         effect.prepare(spec)
     try:
-        host = HostModel(spec.compile())
+        native = spec.compile()
     except ValueError as error:
         raise UserError(f"MuJoCo cannot compile the model: {error}") from error
+    host = HostModel(native)
     model = put_model(host.model) if engine == "mjx" else None
     as_arrays = jax.tree.map(jnp.asarray, tuple(effects))
     return Dynamics(effects=as_arrays, model=model, host=host, engine=engine)

@@ -49,12 +49,17 @@ class HostModel:
             searched for islands, of which it has one.
 
     Raises:
-        UserError: Its timestep is not above 0.
+        UserError: Its timestep is not above 0, or it lets bodies sleep.
     """
 
     def __init__(self, model: mujoco.MjModel):
         if not model.opt.timestep > 0:
             raise UserError(f"timestep is {model.opt.timestep:g} s; expected more than 0")
+        if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+            raise UserError(
+                'the model lets bodies sleep (<flag sleep="enable"/>), which neither engine does '
+                "here; take that out of it"
+            )
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         if model.ntree <= 1:
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND

@@ -19,10 +19,13 @@ OPTION_WORDS = {
 }
 """Options that MJCF gives as a word and MuJoCo as a number."""
 
+LED = ("friction", "damping", "stiffness", "gear", "gainprm", "size")
+"""Fields of several numbers of which the first says most: one number alone is that, as in MJCF."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Override:
-    """One change of a model before it is compiled.
+    """One change of a model before it is compiled; of two of the same field the later counts.
 
     Attributes:
         element: `body`, `joint`, `geom`, `actuator` or `option`.
@@ -30,7 +33,8 @@ class Override:
         field: The field of MuJoCo's spec. A body's `mass` scales its inertia with it, whether it
             is given explicitly or comes from the body's geoms.
         value: The new value; of an option that is a word in MJCF, as `integrator`, the word or
-            MuJoCo's number.
+            MuJoCo's number. Of a field of several numbers all of them; the first alone will do for
+            `friction`, `damping`, `stiffness`, `gear`, `gainprm` and `size`.
     """
 
     element: str
@@ -59,6 +63,8 @@ class Override:
             if self.element == "body" and self.field == "mass":
                 _scale_mass(spec, target, float(value))
             elif np.ndim(current) == 1 and np.ndim(value) == 0:
+                if self.field not in LED:
+                    raise ValueError("too few numbers")
                 current[0] = value
             else:
                 setattr(target, self.field, value)
@@ -67,8 +73,17 @@ class Override:
         except (TypeError, ValueError) as error:
             where = "/".join(filter(None, (self.element, self.name)))
             raise UserError(
-                f"{where} {self.field} = {self.value!r}; expected {_wanted(current)}"
+                f"{where} {self.field} = {self.value!r}; expected {self._wanted(current)}"
             ) from error
+
+    def _wanted(self, current: Any) -> str:
+        """Say what may stand in the place of a field's value."""
+        if isinstance(current, np.ndarray):
+            few = "a finite number or " if self.field in LED else ""
+            return f"{few}{len(current)} finite numbers"
+        if isinstance(current, str):
+            return "a name"
+        return "a finite number" if isinstance(current, float) else "a whole number"
 
     def _find(self, spec: mujoco.MjSpec):
         if self.element == "option":
@@ -94,17 +109,6 @@ def _is_field(target: Any, name: str) -> bool:
 def _is_finite(value: Any) -> bool:
     """Say whether a value is finite, as far as it is numbers."""
     return not isinstance(value, NUMBERS) or bool(np.all(np.isfinite(value)))
-
-
-def _wanted(current: Any) -> str:
-    """Say what may stand in the place of a field's value."""
-    if isinstance(current, np.ndarray):
-        return f"a finite number or {len(current)} of them"
-    if isinstance(current, str):
-        return "a name"
-    if isinstance(current, float):
-        return f"a finite number, as {current:g} is"
-    return f"a whole number, as {int(current)} is"
 
 
 def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:

@@ -121,7 +121,7 @@ def _note(fault: Fault, before: EnvState, transition: Transition, after: EnvStat
     found = jax.tree.map(lambda x: x[worst], (before, transition.action, after))
     is_first = (fault.num_steps == 0) & faulty[worst]
     kept = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), found, tuple(fault[1:]))
-    return Fault(fault.num_steps + faulty.sum(), *kept)
+    return Fault(fault.num_steps + faulty.sum(dtype=jnp.int32), *kept)
 
 
 def unroll(
@@ -158,7 +158,9 @@ def unroll(
     (state, fault), transitions = jax.lax.scan(step, carry, jax.random.split(key, length))
     faults = split.join(jax.tree.map(lambda x: x[None], fault), shares)
     first = jnp.argmax(faults.num_steps > 0)
-    fault = jax.tree.map(lambda x: x[first], faults)._replace(num_steps=faults.num_steps.sum())
+    fault = jax.tree.map(lambda x: x[first], faults)._replace(
+        num_steps=faults.num_steps.sum(dtype=jnp.int32)
+    )
     return split.join(state, shares), split.join(transitions, shares, axis=1), fault
 
 

@@ -12,6 +12,7 @@ from garat_jax import dynamics, engine
 from garat_jax.engine import profiling_clock
 from garat_jax.env import guarded_step, make_world
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
+from garat_jax.errors import UserError
 from tests.models import ARM, spec
 
 
@@ -38,6 +39,13 @@ def test_a_model_of_one_tree_is_not_searched_for_islands_and_no_clock_is_read():
     finally:
         clock.value = None
     np.testing.assert_array_equal(timed.qpos, dynamics.step(world, state, still).qpos)
+
+
+@pytest.mark.parametrize("name", ["mujoco", "mjx"])
+def test_a_model_that_sleeps_is_refused(name):
+    sleepy = ARM.replace("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>', 1)
+    with pytest.raises(UserError, match=r"^the model lets bodies sleep"):
+        dynamics.compile(spec(sleepy), engine=name)
 
 
 @pytest.mark.parametrize("name", ["mujoco", "mjx"])

@@ -224,6 +224,8 @@ def test_mistakes_are_named():
         vector.reset(seed=[1, 2, 3])
     with pytest.raises(ValueError, match="no options, not reset_mask"):
         vector.reset(options={"reset_mask": np.ones(2, bool)})
+    with pytest.raises(ValueError, match="no options, not low"):
+        to_gymnasium(*WALK).reset(options={"low": 1})
     with pytest.raises(ValueError, match="num_envs is 0"):
         to_gymnasium_vector(Walk(), WalkParams(0.1), 0)
     env.reset(seed=0)

@@ -42,7 +42,7 @@ def test_options_that_are_words_in_mjcf_take_the_word_or_the_number():
         (Override("body", "pole", "mass", float("nan")), "body/pole mass = nan; expected a finite"),
         (
             Override("body", "pole", "inertia", [1.0, 2.0]),
-            "expected a finite number or 3 of them",
+            "expected 3 finite numbers",
         ),
         (
             Override("option", "", "integrator", "rk5"),
@@ -50,12 +50,15 @@ def test_options_that_are_words_in_mjcf_take_the_word_or_the_number():
         ),
         (
             Override("option", "", "iterations", "many"),
-            "iterations = 'many'; expected a whole number, as 100 is",
+            "iterations = 'many'; expected a whole number",
         ),
         (
             Override("joint", "hinge", "range", [0.0, float("inf")]),
-            "expected a finite number or 2 of them",
+            "expected 2 finite numbers",
         ),
+        (Override("option", "", "gravity", -9.81), "gravity = -9.81; expected 3 finite numbers"),
+        (Override("joint", "hinge", "range", 1.0), "expected 2 finite numbers"),
+        (Override("joint", "hinge", "damping", []), "a finite number or 3 finite numbers"),
         (Override("joint", "hinge", "parent", 1.0), "unknown joint field 'parent'"),
         (Override("option", "", "timestep", 0.0), "timestep is 0 s; expected more than 0"),
         (Override("option", "", "timestep", -0.1), "timestep is -0.1 s; expected more than 0"),

@@ -29,6 +29,11 @@ def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     return observations, gymnasium.spaces.Box(low, high, dtype=np.float32)
 
 
+def _check_no_options(options: dict[str, Any] | None) -> None:
+    if options:
+        raise ValueError(f"there are no options, not {', '.join(options)}")
+
+
 def _as_actions(actions: Any, space: gymnasium.spaces.Space) -> np.ndarray:
     """Return actions as an array of a space's shape; bounds are the environment's to keep."""
     array = np.asarray(actions, np.float32)
@@ -76,7 +81,12 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; a seed fixes this and all that follow. There are no options."""
+        """Start an episode; a seed fixes this and all that follow.
+
+        Raises:
+            ValueError: Options are given; there are none.
+        """
+        _check_no_options(options)
         super().reset(seed=seed)
         if seed is not None or self._key is None:
             self._key = _first_key(self.np_random)
@@ -136,8 +146,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             ValueError: There is another number of seeds than of environments, or options are given.
         """
-        if options:
-            raise ValueError(f"there are no options, not {', '.join(options)}")
+        _check_no_options(options)
         seeds = [seed] * self.num_envs if seed is None else seed
         if isinstance(seeds, int):
             seeds = [seeds + i for i in range(self.num_envs)]

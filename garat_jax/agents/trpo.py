@@ -266,7 +266,7 @@ def line_search(flat, full_step, evaluate, config: TRPOConfig) -> tuple[jax.Arra
         tries, good, _ = carry
         return ~good & (tries < config.line_search_steps)
 
-    start = (jnp.zeros((), jnp.float32), jnp.zeros((), bool), jnp.ones(()))
+    start = (jnp.zeros((), jnp.float32), jnp.zeros((), bool), jnp.ones((), jnp.float32))
     _, good, fraction = jax.lax.while_loop(unfinished, attempt, start)
     fraction = jnp.where(good, fraction, 0.0)
     return flat + fraction * full_step, fraction

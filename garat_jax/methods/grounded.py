@@ -181,7 +181,7 @@ def decode_action(
     middle = (env.action_high + env.action_low) / 2
 
     def decode(action: jax.Array, output: jax.Array) -> jax.Array:
-        origin = action if output_is == "change" else np.array(middle, action.dtype)
+        origin = action if output_is == "change" else jnp.asarray(middle, action.dtype)
         reached = np.array(reach * half_range, action.dtype)  # new arrays, as in `Env.clip`
         return env.clip(origin + reached * jnp.clip(output, -1, 1))
 

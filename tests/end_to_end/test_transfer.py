@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -27,7 +28,7 @@ pytestmark = pytest.mark.slow  # a dozen programs to compile
 NAME = "inverted_pendulum_heavy"
 SEEDS = [0, 1]
 REPOSITORY = Path(__file__).resolve().parents[2]
-GARAT = "import sys; from garat_jax.cli import main; sys.exit(main())"
+GARAT = "from garat_jax.cli import entry; entry()"
 STAGES = [
     "source policy",
     "target policy",
@@ -75,6 +76,12 @@ def directory(path: Path, resume: bool = False) -> RunDirectory:
 def finished(tmp_path_factory):
     root = tmp_path_factory.mktemp("transfer") / "run"
     return root, run_transfer(tiny(), directory(root))
+
+
+def test_it_runs_where_jax_counts_in_double_precision(tmp_path):
+    with jax.enable_x64(True):
+        result = run_transfer(tiny(), directory(tmp_path))
+    assert np.isfinite(result["returns"]["method"]).all()
 
 
 def test_it_leaves_a_summary_of_everything(finished):
