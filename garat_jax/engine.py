@@ -47,6 +47,7 @@ class HostModel:
         model: The model. Its automatic reset on bad states is off: a simulation that diverges
             stays diverged in both engines, and the caller sees it. One of a single tree is not
             searched for islands, of which it has one.
+        digest: What its content is compared by.
 
     Raises:
         UserError: Its timestep is not above 0, or it lets bodies sleep.
@@ -67,13 +68,13 @@ class HostModel:
         self.model = model
         buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, buffer)
-        self._digest = hashlib.sha256(buffer.tobytes()).hexdigest()
+        self.digest = hashlib.sha256(buffer.tobytes()).hexdigest()
 
     def __hash__(self) -> int:
-        return hash(self._digest)
+        return hash(self.digest)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, HostModel) and self._digest == other._digest
+        return isinstance(other, HostModel) and self.digest == other.digest
 
     @functools.cached_property
     def sizes(self) -> tuple[int, ...]:
@@ -133,7 +134,7 @@ class HostModel:
         inputs = {"row": row, "control": control, **fields}
         dtype = str(row.dtype)
         result = host_call.call(
-            " ".join((self._digest, name, dtype, *inputs)),
+            " ".join((self.digest, name, dtype, *inputs)),
             functools.partial(self._on_host, function, dtype, tuple(fields)),
             int(np.prod(shape)) * (row.dtype.itemsize // 4),
             [_to_words(value.astype(row.dtype)) for value in inputs.values()],
@@ -204,7 +205,7 @@ class HostModel:
     @contextlib.contextmanager
     def _simulations(self, num: int, fields: tuple[str, ...]) -> Iterator["_Simulations"]:
         """Lend simulations for a batch size; each set of changed fields has its own."""
-        key = (self._digest, num, fields)
+        key = (self.digest, num, fields)
         with _idle_lock:
             found = [index for index, (kept, _) in enumerate(_idle) if kept == key]
             simulations = _idle.pop(found[-1])[1] if found else None

@@ -1,6 +1,7 @@
 """The command `garat ground`: read the files, learn, write the run with its report."""
 
 import dataclasses
+import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,8 @@ def run_ground(
     loaded = load_model(model, catalogue)
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
     acting = load_policy(policy, loaded, recordings) if policy else None
-    run.record_settings(config)
+    files = [model, *data, *holdout, *(path for path in (columns, policy) if path)]
+    run.record_settings({**to_plain(config), "contents": _contents(loaded, files)})
     done = ground(
         loaded,
         recordings,
@@ -81,6 +83,13 @@ def run_ground(
     run.write_json(SUMMARY, finite_or_null(to_plain(done.summary)))
     _write_report(run, done, loaded.name)
     return done
+
+
+def _contents(model: Model, files: Sequence[Path]) -> dict[str, str]:
+    """Return a digest of each file and of the compiled model: a resumed run has the same."""
+    digests = {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    compiled = model.compile(engine="mujoco").host.digest
+    return {path: digest[:16] for path, digest in {**digests, "compiled model": compiled}.items()}
 
 
 def load_policy(path: Path, model: Model, recordings: Sequence[Recording]) -> Policy:

@@ -116,12 +116,29 @@ def grounded(recorded, tmp_path_factory):
     policy.write_text(
         "import jax.numpy as jnp\ndef policy(obs, key): return jnp.sin(9 * obs[:1])\n"
     )
-    names = [str(file) for file in recorded[1]]
-    command = ["ground", str(recorded[0]), *names, "--policy", str(policy)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(presets.GROUNDING, "gat", SMALL)
-        assert cli.main([*command, "--out", str(folder / "gat")]) == 0
+        assert cli.main(command(recorded, folder / "gat")) == 0
     return folder / "gat"
+
+
+def command(recorded, out) -> list[str]:
+    names = [str(file) for file in recorded[1]]
+    acting = ["--policy", str(out.parent / "mine.py")]
+    return ["ground", str(recorded[0]), *names, *acting, "--out", str(out)]
+
+
+def test_a_run_does_not_go_on_with_other_recordings(recorded, grounded, monkeypatch, capsys):
+    monkeypatch.setitem(presets.GROUNDING, "gat", SMALL)
+    file = recorded[1][0]
+    text = file.read_text()
+    try:
+        file.write_text(text.rstrip().rpartition("\n")[0] + "\n")
+        assert cli.main([*command(recorded, grounded), "--resume"]) == 2
+    finally:
+        file.write_text(text)
+    said = capsys.readouterr().err
+    assert f"{grounded} was started with settings.contents.{file} = " in said
 
 
 def test_a_run_holds_what_scripts_read(grounded):
