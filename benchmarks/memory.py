@@ -21,7 +21,7 @@ from garat_jax import compilation_cache
 
 LIMIT = 2048.0
 """MiB that no pair should need."""
-STAGE = re.compile(r"memory ([\d.]+) MiB of states and ([\d.]+) MiB on the way")
+STAGE = re.compile(r"memory ([\d.]+) MiB of states and ([\d.]+) MiB more")
 """What a stage prints: states that go in and come out, and what an iteration needs besides."""
 
 

@@ -175,11 +175,13 @@ class TaskEnv(Env):
             command [nu]) -> command that is sent instead.
 
     Raises:
-        UserError: A control step lasts longer or shorter than the task's reward counts on.
+        UserError: A control step lasts longer or shorter than the task's reward counts on, or the
+            task returns something else than a `Task` does.
     """
 
     def __init__(self, task: Task, world: Dynamics, transform: Transform | None = None):
         host = world.host.model
+        _check_lengths(task)
         _check_duration(task, task.num_substeps * world.timestep)
         self.transform = transform
         limited = host.actuator_ctrllimited.astype(bool)
@@ -187,8 +189,7 @@ class TaskEnv(Env):
         self.episode_length = task.episode_length
         self.action_low = np.where(limited, host.actuator_ctrlrange[:, 0], -np.inf)
         self.action_high = np.where(limited, host.actuator_ctrlrange[:, 1], np.inf)
-        shape = jax.eval_shape(self.reset, world, jax.random.key(0))
-        self.obs_size = shape.obs.shape[0]
+        self.obs_size = _check_shapes(task, world)
 
     def reset(self, params: Dynamics, key: jax.Array) -> EnvState:
         """Start an episode at a state drawn by the task."""
@@ -205,8 +206,14 @@ class TaskEnv(Env):
     def step_sending(
         self, params: Dynamics, state: EnvState, action: jax.Array, sent: jax.Array, key: jax.Array
     ) -> StepResult:
-        """Hold what is sent, clipped, as the command for one control step."""
+        """Hold what is sent, clipped, as the command for one control step.
+
+        Raises:
+            UserError: An action has another shape.
+        """
         del key
+        for given in (action, sent):
+            _check_shape("the action", given, (self.action_size,))
         action = self.clip(action)
         command = self._command(params, state.physics, self.clip(sent))
         physics = dynamics.step(params, state.physics, command, self.task.num_substeps)
@@ -233,6 +240,44 @@ class TaskEnv(Env):
     def _observe(self, params: Dynamics, physics: PhysicsState) -> jax.Array:
         """Return the observation [obs_size] of what the sensors report."""
         return self.task.observe(dynamics.sensed(params, physics))
+
+
+def _check_lengths(task: Task) -> None:
+    for name in ("num_substeps", "episode_length"):
+        value = getattr(task, name)
+        if not isinstance(value, int | np.integer) or value < 1:
+            raise UserError(
+                f"{type(task).__name__}.{name} is {value!r}; expected a whole number from 1"
+            )
+
+
+def _check_shapes(task: Task, world: Dynamics) -> int:
+    """Return the length of the observation that a task makes in a world, whose rest is checked."""
+    host, name = world.host.model, type(task).__name__
+    start = jax.eval_shape(lambda key: task.initial(host, key), jax.random.key(0))
+    if not isinstance(start, tuple) or len(start) != 2:
+        raise UserError(f"{name}.initial returns {type(start).__name__}; expected (qpos, qvel)")
+    for what, value, size in (("qpos", start[0], host.nq), ("qvel", start[1], host.nv)):
+        _check_shape(f"{what} of {name}.initial", value, (size,))
+    state = jax.eval_shape(lambda start: dynamics.initial_state(world, *start), start)
+    obs = jax.eval_shape(task.observe, state)
+    if len(_shape(obs)) != 1:
+        _check_shape(f"what {name}.observe returns", obs, ("obs_size",))
+    reward = jax.eval_shape(task.reward, state, jax.ShapeDtypeStruct((host.nu,), "float32"), state)
+    _check_shape(f"what {name}.reward returns", reward, ())
+    _check_shape(f"what {name}.terminated returns", jax.eval_shape(task.terminated, state), ())
+    return obs.shape[0]
+
+
+def _check_shape(what: str, value: Any, shape: tuple[Any, ...]) -> None:
+    if _shape(value) != shape:
+        wanted = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+        raise UserError(f"{what} has the shape {_shape(value)}; expected {wanted}")
+
+
+def _shape(value: Any) -> Any:
+    """Return the shape of what may be an array, or a number."""
+    return value.shape if hasattr(value, "shape") else np.shape(value)
 
 
 def _check_duration(task: Task, seconds: float) -> None:

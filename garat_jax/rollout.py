@@ -11,8 +11,8 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
-from garat_jax import split
-from garat_jax.env import Env, EnvState, guarded_step
+from garat_jax import dynamics, split
+from garat_jax.env import Env, EnvState, World, guarded_step
 from garat_jax.types import Params, Policy, Transition
 
 Tree = TypeVar("Tree")
@@ -205,6 +205,16 @@ def without_faults(steps: Tree, faulty: jax.Array) -> Tree:
         return x.reshape(flat.size, *x.shape[faulty.ndim :])[chosen].reshape(x.shape)
 
     return jax.tree.map(choose, steps)
+
+
+def as_of(source: World, target: World, recorded: Recorded) -> Recorded:
+    """Return what was recorded in the target with states, [T, B], that the source can begin in."""
+    effects = [jax.tree.structure(world.params.effects) for world in (source, target)]
+    if effects[0] == effects[1]:
+        return recorded
+    adopt = jax.vmap(jax.vmap(functools.partial(dynamics.adopt, source.params)))
+    states = recorded.states._replace(physics=adopt(recorded.states.physics))
+    return recorded._replace(states=states)
 
 
 def thinned(recorded: Recorded, num_transitions: int) -> Recorded:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
+from scipy import stats
 
 from garat_jax import report
 from garat_jax.report import Fact, Figure, Section, Table
@@ -14,7 +15,14 @@ SOURCE_FRACTION = 0.3
 """A seed is meaningful only if its source policy gets less than this share of the target's."""
 TARGET_FRACTION = 0.95
 """And only if its target policy gets at least this share of what counts as solved."""
-CONTROLS = ("more_source_training", "action_noise")
+CONTROLS = {"more_source_training": "more source training", "action_noise": "action noise only"}
+"""What is trained beside the method, and what that is called."""
+REASONS = (
+    "the source policy does not solve the source",
+    "the policy trained in the target does not solve it",
+    "the source policy works in the target as it is",
+)
+"""Why a seed is not meaningful."""
 
 
 def summarise(
@@ -53,7 +61,8 @@ def summarise(
     source, target = returns["source_policy"], returns["target_policy"]
     solved = solved_return - (1.0 - TARGET_FRACTION) * abs(solved_return)
     is_lost = target - source > (1.0 - SOURCE_FRACTION) * np.abs(target)  # returns may be costs
-    meaningful = source_solved & is_lost & (target >= solved)
+    kept = np.stack([source_solved, target >= solved, is_lost])
+    meaningful = np.asarray(kept.all(axis=0))
     scaled = {
         name: scale(returns[name], source, target, meaningful) for name in ("method", *CONTROLS)
     }
@@ -65,6 +74,7 @@ def summarise(
         "returns": {name: returns[name] for name in ("source_policy", "target_policy", "method")},
         "source_solved": source_solved,
         "meaningful": meaningful,
+        "not_meaningful_because": [None if k.all() else REASONS[np.argmin(k)] for k in kept.T],
         "scaled": scaled["method"],
         "controls": {name: {"returns": returns[name], "scaled": scaled[name]} for name in CONTROLS},
         "transition_error": {name: errors[name] for name in ("source", "grounded", "zero_action")},
@@ -131,28 +141,53 @@ def lead(summary: Mapping[str, Any]) -> str:
     ratio = np.mean(summary["error_ratio"])
     if mean is None:
         return (
-            "No seed is meaningful: the source policy did not solve the source or already works in "
-            "the target, or no policy solved the target. Nothing can be "
-            "said about the method from this run."
+            f"No seed is meaningful: {_left_out(summary)}. Nothing can be said about the method "
+            "from this run."
         )
     return (
         f"After grounding, the policy reaches {mean:.2f} of the way from the source policy (0) to "
         f"a policy trained in the target (1), and one step of the grounded source is off by "
-        f"{ratio:.2f} times what one step of the source is."
+        f"{ratio:.2f} times what one step of the source is. {_beside_controls(summary)}"
     )
+
+
+def _beside_controls(summary: Mapping[str, Any]) -> str:
+    """Say whether the better control leaves it to grounding that the policy transfers."""
+    scaled = {name: summary["controls"][name]["scaled"] for name in CONTROLS}
+    name = max(CONTROLS, key=lambda name: scaled[name]["mean"])
+    beside = f"{CONTROLS[name].capitalize()}, the better of two controls, reaches"
+    beside += f" {scaled[name]['mean']:.2f}"
+    kept = np.asarray(summary["meaningful"], bool)
+    lead = np.asarray(summary["scaled"]["per_seed"])[kept].astype(float)
+    lead -= np.asarray(scaled[name]["per_seed"])[kept].astype(float)
+    if len(lead) == 1:
+        return f"{beside}; one seed cannot tell whether that is chance."
+    half = stats.t.ppf(0.975, len(lead) - 1) * lead.std(ddof=1) / np.sqrt(len(lead))
+    if lead.mean() > half:
+        return f"{beside}: the difference is the work of grounding."
+    return f"{beside}: these seeds do not show that it is grounding that helps."
+
+
+def _left_out(summary: Mapping[str, Any]) -> str:
+    """Say which seeds are not meaningful, and why."""
+    reasons = zip(summary["seeds"], summary["not_meaningful_because"], strict=True)
+    return "; ".join(f"seed {seed}: {reason}" for seed, reason in reasons if reason)
 
 
 def describe(summary: Mapping[str, Any]) -> str:
     """Return the result in a few lines for a terminal."""
     controls = summary["controls"]
     baseline = np.mean(summary["baselines"]["zero_action"]["ratio"])
+    has_spread = summary["scaled"]["standard_error"] is not None
+    spread = ", mean ± standard error" if has_spread else ""
     lines = [
         lead(summary),
-        "Scaled return in the target (0: source policy, 1: policy trained there), mean ± standard "
-        "error:",
+        f"Scaled return in the target (0: source policy, 1: policy trained there){spread}:",
         f"  {summary['method']:<22}{_with_error(summary['scaled'])}",
-        f"  {'more source training':<22}{_with_error(controls['more_source_training']['scaled'])}",
-        f"  {'action noise only':<22}{_with_error(controls['action_noise']['scaled'])}",
+        *(
+            f"  {label:<22}{_with_error(controls[name]['scaled'])}"
+            for name, label in CONTROLS.items()
+        ),
         f"Error of one step, share of the source's: {np.mean(summary['error_ratio']):.3f}; "
         f"with zero action {baseline:.3f}.",
     ]
@@ -245,17 +280,8 @@ def _returns_figure(summary: Mapping[str, Any]) -> go.Figure:
 
 
 def _returns_caption(summary: Mapping[str, Any]) -> str:
-    left_out = [
-        str(seed)
-        for seed, good in zip(summary["seeds"], summary["meaningful"], strict=True)
-        if not good
-    ]
-    note = (
-        f" Seeds {', '.join(left_out)} are not meaningful and are left out: their source policy "
-        "does not solve the source or already works in the target, or their target policy fails."
-        if left_out
-        else ""
-    )
+    left_out = _left_out(summary)
+    note = f" Left out as not meaningful: {left_out}." if left_out else ""
     episodes = summary["num_episodes"]
     return f"Mean over seeds (bars) and every seed (dots), {episodes} episodes each.{note}"
 

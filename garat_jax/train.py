@@ -26,6 +26,14 @@ REPORT_SECONDS = 5.0
 LARGEST_FAULTY_SHARE = 0.01
 """Share of a batch's steps in which physics may leave the finite numbers before training stops."""
 FAULTY = "faulty_share"
+SHOWN = {
+    "evaluation": "return",
+    "reward": "reward a step",
+    "episode_length": "steps an episode",
+    "discriminator_accuracy": "discriminator's accuracy",
+    "error_ratio": "error of one step, share of the source's",
+}
+"""Metrics that are printed, and what they are called there."""
 
 SECONDS = "seconds.json"
 
@@ -186,14 +194,13 @@ class Trainer:
             checkpoint.save(folder, iteration, state)
 
     def _report(self, stage: str, iteration: int, of: int, metrics) -> None:
-        line = f"{stage}: {iteration}/{of}"
-        if metrics is not None:
-            line += "".join(
-                f"  {name} {value.mean():.3g}"
-                for name, value in metrics.items()
-                if name in ("evaluation", "episode_length", "discriminator_accuracy", "error_ratio")
-            )
-        self.console.print(line)
+        if metrics is None:
+            self.console.print(f"{stage}: done after {iteration} iterations")
+            return
+        shown = [
+            f"{SHOWN[name]} {value.mean():,.4g}" for name, value in metrics.items() if name in SHOWN
+        ]
+        self.console.print(", ".join([f"{stage}: {iteration} of {of}", *shown]))
 
     def _check(self, stage: str, iteration: int, last, new, metrics, finite: np.ndarray) -> None:
         """Stop where a learner is not finite or its worlds fail too often; warn where one does."""
@@ -258,14 +265,14 @@ def _memory(compiled: jax.stages.Compiled) -> str:
         return process
     held = sizes.argument_size_in_bytes + sizes.output_size_in_bytes
     return (
-        f"{held / 2**20:.1f} MiB of states and {sizes.temp_size_in_bytes / 2**20:.1f} MiB on the "
-        f"way in an iteration, {process}"
+        f"{held / 2**20:.1f} MiB of states and {sizes.temp_size_in_bytes / 2**20:.1f} MiB more "
+        f"within an iteration, {process}"
     )
 
 
 def _too_many(share: np.ndarray) -> str:
     return (
-        f"saw physics leave the finite numbers in {100 * share.max():.2g} % of the steps "
+        f"saw physics leave the finite numbers in {100 * share.max():.3g} % of the steps "
         f"(up to {100 * LARGEST_FAULTY_SHARE:g} % is let pass)"
     )
 

@@ -6,7 +6,6 @@ the ungrounded source, and training with action noise alone.
 """
 
 import dataclasses
-import functools
 import zlib
 from typing import Any
 
@@ -14,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from garat_jax import dynamics, rollout, split, summary, train
+from garat_jax import rollout, split, summary, train
 from garat_jax.agents import trpo
 from garat_jax.agents.actor_critic import ActorCriticState, PolicyParams
 from garat_jax.agents.trpo import TRPOConfig
@@ -22,9 +21,11 @@ from garat_jax.compiler_options import compiler_options
 from garat_jax.dynamics import Override
 from garat_jax.effects import Effect
 from garat_jax.env import Env, Task, World, make_world
-from garat_jax.methods.garat import GARAT, GARATConfig
-from garat_jax.methods.gat import GAT, GATConfig
+from garat_jax.errors import UserError
+from garat_jax.methods.garat import GARATConfig
+from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.grounded import GroundedEnv, Grounding, action_noise, check_bounded
+from garat_jax.methods.make import make_method
 from garat_jax.methods.transition_error import (
     best_constant,
     check_differs,
@@ -34,7 +35,7 @@ from garat_jax.methods.transition_error import (
 from garat_jax.rollout import Recorded
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer, UntilSolved
-from garat_jax.types import Agent, Params, Policy
+from garat_jax.types import Agent, Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +74,11 @@ class Pair:
 
 @dataclasses.dataclass(frozen=True)
 class TransferConfig:
-    """Settings of one transfer experiment; presets give tuned ones."""
+    """Settings of one transfer experiment; presets give tuned ones.
+
+    Raises:
+        UserError: There is nothing to train, to learn from or to evaluate on.
+    """
 
     pair: Pair
     method: str
@@ -90,6 +95,16 @@ class TransferConfig:
     action_noise: float = 0.135  # half-ranges: the transformer's initial standard deviation
     num_episodes: int = 50  # Desai et al. 2020
     num_solving_episodes: int = 20
+
+    def __post_init__(self) -> None:
+        """Refuse what would fail after hours."""
+        least = {"seeds": 1, "num_episodes": 1, "num_solving_episodes": 1}
+        least |= dict.fromkeys(("num_updates", "num_retraining", "first_seed"), 0)
+        each = self.agent.num_envs  # as many transitions are one step
+        least |= dict.fromkeys(("num_target_transitions", "num_curve_transitions"), each)
+        for name, number in least.items():
+            if getattr(self, name) < number:
+                raise UserError(f"{name} is {getattr(self, name)}; expected {number} or more")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,7 +255,9 @@ class Experiment:
             faulty = recorded.transitions.faulty
             transitions, states = rollout.without_faults(recorded, faulty)
             executed = transitions._replace(action=target.env.clip(transitions.action))
-            return as_of(self.worlds.source, target, Recorded(executed, states)), faulty.mean()
+            return rollout.as_of(
+                self.worlds.source, target, Recorded(executed, states)
+            ), faulty.mean()
 
         return self.map_guarded(name, collect, policy, _fold(self.keys, name))
 
@@ -280,23 +297,6 @@ class Experiment:
             return transition_error(source.env, source.params, held_out)
 
         return self.map_guarded("the source's error", error, held_out)
-
-
-def as_of(source: World, target: World, recorded: Recorded) -> Recorded:
-    """Return what was recorded in the target with states, [T, B], that the source can begin in."""
-    effects = [jax.tree.structure(world.params.effects) for world in (source, target)]
-    if effects[0] == effects[1]:
-        return recorded
-    adopt = jax.vmap(jax.vmap(functools.partial(dynamics.adopt, source.params)))
-    states = recorded.states._replace(physics=adopt(recorded.states.physics))
-    return recorded._replace(states=states)
-
-
-def make_method(env: Env, agent: Policy, config: GARATConfig | GATConfig) -> GARAT | GAT:
-    """Build the method that a config belongs to, for a source and a fixed agent's policy."""
-    if isinstance(config, GATConfig):
-        return GAT(env, agent, config)
-    return GARAT(env, agent, config)
 
 
 def run_transfer(config: TransferConfig, run: RunDirectory) -> dict[str, Any]:

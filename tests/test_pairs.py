@@ -14,8 +14,8 @@ from garat_jax.envs.pairs import PAIRS
 from garat_jax.methods.transition_error import transition_error
 from garat_jax.overrides import load_spec
 from garat_jax.presets import METHODS
+from garat_jax.rollout import as_of
 from garat_jax.runs import RunDirectory
-from garat_jax.transfer import as_of
 
 # Desai et al. 2020, table of modified environments.
 MASSES = [

@@ -15,8 +15,8 @@ from garat_jax.effects import CATALOGUE
 from garat_jax.env import make_world
 from garat_jax.envs import ENVS
 from garat_jax.envs.pairs import PAIRS
+from garat_jax.methods.make import make_method
 from garat_jax.presets import METHODS
-from garat_jax.transfer import make_method
 from tests.models import showing, spec
 
 QUICK = ("inverted_pendulum",)

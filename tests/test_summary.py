@@ -124,7 +124,8 @@ def test_the_report_tells_the_result_and_names_the_seeds_left_out(run):
     assert "a heavier thing" in text
     assert "every seed (dots), 7 episodes each" in text
     assert "0.50 ± 0.50" in text
-    assert "Seeds 1 are not meaningful" in text
+    works = "the source policy works in the target as it is"
+    assert f"Left out as not meaningful: seed 1: {works}." in text
 
 
 def test_when_no_seed_is_meaningful_there_is_no_mean_and_the_report_says_so(run):
@@ -134,8 +135,43 @@ def test_when_no_seed_is_meaningful_there_is_no_mean_and_the_report_says_so(run)
     assert result["controls"]["action_noise"]["scaled"] == nothing
     assert summary.facts(result)[0].value == "–"
     text = written(run, result)
-    assert "Seeds 0, 1, 2 are not meaningful" in text
-    assert "nan" not in summary.lead(result)
+    reason = "the source policy works in the target as it is"
+    said = "; ".join(f"seed {seed}: {reason}" for seed in SEEDS)
+    assert f"Left out as not meaningful: {said}." in text
+    assert summary.lead(result).startswith(f"No seed is meaningful: {said}. Nothing")
+
+
+@pytest.mark.parametrize(
+    ("method", "control", "said"),
+    [
+        ([1000.0, 990.0, 1000.0], [190.0, 200.0, 150.0], "the difference is the work of grounding"),
+        ([1000.0, 990.0, 1000.0], [980.0, 995.0, 970.0], "do not show that it is grounding that"),
+        ([1000.0], [190.0], "reaches 0.10; one seed cannot tell whether that is chance"),
+    ],
+)
+def test_the_better_control_stands_beside_the_method(method, control, said):
+    count = len(method)
+    returns = {
+        "source_policy": np.full(count, 100.0),
+        "target_policy": np.full(count, 1000.0),
+        "method": np.asarray(method),
+        "more_source_training": np.asarray(control),
+        "action_noise": np.full(count, 100.0),
+    }
+    result = summarise(count=count, returns=returns)
+    assert "More source training, the better of two controls, reaches" in summary.lead(result)
+    assert said in summary.lead(result)
+    assert ("standard error" in summary.describe(result)) == (count > 1)
+
+
+def test_it_says_which_condition_each_seed_left_out_fails():
+    result = summarise(
+        (100.0, 900.0, 100.0),
+        (1000.0, 1000.0, 500.0),
+        source_solved=np.asarray([False, True, True]),
+    )
+    first, target, lost = summary.REASONS
+    assert result["not_meaningful_because"] == [first, lost, target]
 
 
 def test_a_grounding_without_updates_can_be_reported(run):

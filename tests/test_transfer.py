@@ -14,7 +14,7 @@ from garat_jax.dynamics import Override
 from garat_jax.env import EnvState, make_world
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.envs.pairs import PAIRS
-from garat_jax.errors import DivergedError
+from garat_jax.errors import DivergedError, UserError
 from garat_jax.presets import METHODS
 from garat_jax.rollout import Recorded, thinned
 from garat_jax.runs import RunDirectory
@@ -33,6 +33,21 @@ def test_thinned_keeps_whole_transitions_evenly_in_time(wanted, kept):
     found = thinned(recorded, wanted)
     for leaf in jax.tree.leaves(found):
         np.testing.assert_array_equal(leaf, numbers[:, kept])
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"seeds": 0}, "seeds is 0; expected 1 or more"),
+        ({"num_target_transitions": 49}, "num_target_transitions is 49; expected 50 or more"),
+        ({"num_episodes": 0}, "num_episodes is 0; expected 1 or more"),
+        ({"num_updates": -1}, "num_updates is -1; expected 0 or more"),
+    ],
+)
+def test_settings_that_would_fail_at_the_end_are_refused_at_once(changed, said):
+    config = METHODS["garat"](PAIRS["inverted_pendulum_heavy"])
+    with pytest.raises(UserError, match=said):
+        dataclasses.replace(config, agent=TRPOConfig(num_envs=50), **changed)
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,7 @@ from garat_jax.ground.source import FORMAT, TRANSFORMER, make_source, with_trans
 from garat_jax.ground.steps import choose_bounds, control_paths, control_steps, draw, longest_path
 from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.grounded import GroundedEnv, Grounding
+from garat_jax.methods.make import make_method
 from garat_jax.methods.recorded import (
     Paths,
     RecordedEnv,
@@ -36,7 +37,7 @@ from garat_jax.methods.recorded import (
 from garat_jax.methods.transition_error import check_differs, constant_error, transition_error
 from garat_jax.runs import RunDirectory
 from garat_jax.train import FAULTY, Trainer
-from garat_jax.transfer import GroundConfig, make_method
+from garat_jax.transfer import GroundConfig
 from garat_jax.types import Params, Policy
 
 MOST_PATHS = 100

@@ -15,9 +15,10 @@ from garat_jax.dynamics import Dynamics, Override
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.errors import UserError, choose
 from garat_jax.ground.steps import Bounds
+from garat_jax.methods.make import make_method
 from garat_jax.methods.recorded import RecordedEnv, Steps, as_transitions, clone, cloned
 from garat_jax.runs import RunDirectory
-from garat_jax.transfer import GroundConfig, make_method
+from garat_jax.transfer import GroundConfig
 
 FORMAT = "garat-ground/2"
 CARD, SUMMARY, TRANSFORMER = "model.toml", "summary.json", "transformer"

@@ -23,9 +23,9 @@ from garat_jax.ground.source import make_source, with_transformer
 from garat_jax.ground.steps import choose_bounds, control_steps, draw
 from garat_jax.methods.garat import GARATConfig
 from garat_jax.methods.gat import GATConfig
+from garat_jax.methods.make import make_method
 from garat_jax.methods.recorded import as_transitions, clone, cloned, needed_change
 from garat_jax.runs import RunDirectory
-from garat_jax.transfer import make_method
 from tests import models
 from tests.probe_envs import Hang
 
