@@ -50,6 +50,7 @@ def test_the_readmes_world_runs(capsys):
     assert "(64, 4)" in capsys.readouterr().out
 
 
+@pytest.mark.filterwarnings("ignore:Brax System:UserWarning")
 def test_the_page_on_your_own_robot_runs(tmp_path, monkeypatch, capsys):
     page = (REPOSITORY / "docs" / "own_robot.md").read_text(encoding="utf-8")
     (model,) = re.findall(r"```xml\n(.*?)```", page, re.DOTALL)
