@@ -51,6 +51,7 @@ def test_the_readmes_world_runs(capsys):
 
 
 @pytest.mark.filterwarnings("ignore:Brax System:UserWarning")
+@pytest.mark.filterwarnings("ignore:Accessing .* directly from `Data` is deprecated")
 def test_the_page_on_your_own_robot_runs(tmp_path, monkeypatch, capsys):
     page = (REPOSITORY / "docs" / "own_robot.md").read_text(encoding="utf-8")
     (model,) = re.findall(r"```xml\n(.*?)```", page, re.DOTALL)
