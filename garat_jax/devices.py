@@ -91,6 +91,8 @@ def join_processes(
         jax.distributed.initialize(
             coordinator, _or_variable(num_processes, "JAX_NUM_PROCESSES"), number
         )
+    except UserError:
+        raise
     except (RuntimeError, ValueError) as error:
         raise UserError(
             f"the processes do not come together: {error}; give --coordinator HOST:PORT, "

@@ -125,6 +125,7 @@ class Env(abc.ABC):
         JAX keeps an array that it met in a program, by its identity, in the precision of then:
         these are new ones for each.
         """
+        action = _as_float(action)
         low, high = (np.array(x, action.dtype) for x in (self.action_low, self.action_high))
         return jnp.clip(action, low, high)
 
@@ -213,12 +214,12 @@ class TaskEnv(Env):
         """
         del key
         for given in (action, sent):
-            _check_shape("the action", given, (self.action_size,))
+            _check_shape("the action", jnp.asarray(given), (self.action_size,))
         action = self.clip(action)
         command = self._command(params, state.physics, self.clip(sent))
         physics = dynamics.step(params, state.physics, command, self.task.num_substeps)
-        reward = self.task.reward(state.physics, action, physics)
-        terminated = self.task.terminated(physics)
+        reward = _as_float(self.task.reward(state.physics, action, physics))
+        terminated = jnp.asarray(self.task.terminated(physics), bool)
         steps = state.steps + 1
         truncated = (steps >= self.episode_length) & ~terminated
         after = EnvState(physics, self._observe(params, physics), steps)
@@ -242,6 +243,12 @@ class TaskEnv(Env):
         return self.task.observe(dynamics.sensed(params, physics))
 
 
+def _as_float(value: Any) -> jax.Array:
+    """Return numbers as an array of floats, of their own precision if that is 32 bits or more."""
+    array = jnp.asarray(value)
+    return array.astype(jnp.result_type(array, jnp.float32))
+
+
 def _check_lengths(task: Task) -> None:
     for name in ("num_substeps", "episode_length"):
         value = getattr(task, name)
@@ -255,14 +262,14 @@ def _check_shapes(task: Task, world: Dynamics) -> int:
     """Return the length of the observation that a task makes in a world, whose rest is checked."""
     host, name = world.host.model, type(task).__name__
     start = jax.eval_shape(lambda key: task.initial(host, key), jax.random.key(0))
-    if not isinstance(start, tuple) or len(start) != 2:
+    if not isinstance(start, tuple | list) or len(start) != 2:
         raise UserError(f"{name}.initial returns {type(start).__name__}; expected (qpos, qvel)")
     for what, value, size in (("qpos", start[0], host.nq), ("qvel", start[1], host.nv)):
         _check_shape(f"{what} of {name}.initial", value, (size,))
     state = jax.eval_shape(lambda start: dynamics.initial_state(world, *start), start)
     obs = jax.eval_shape(task.observe, state)
-    if len(_shape(obs)) != 1:
-        _check_shape(f"what {name}.observe returns", obs, ("obs_size",))
+    size = ("obs_size",) if len(getattr(obs, "shape", ())) != 1 else obs.shape
+    _check_shape(f"what {name}.observe returns", obs, size)
     reward = jax.eval_shape(task.reward, state, jax.ShapeDtypeStruct((host.nu,), "float32"), state)
     _check_shape(f"what {name}.reward returns", reward, ())
     _check_shape(f"what {name}.terminated returns", jax.eval_shape(task.terminated, state), ())
@@ -270,14 +277,11 @@ def _check_shapes(task: Task, world: Dynamics) -> int:
 
 
 def _check_shape(what: str, value: Any, shape: tuple[Any, ...]) -> None:
-    if _shape(value) != shape:
-        wanted = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
-        raise UserError(f"{what} has the shape {_shape(value)}; expected {wanted}")
-
-
-def _shape(value: Any) -> Any:
-    """Return the shape of what may be an array, or a number."""
-    return value.shape if hasattr(value, "shape") else np.shape(value)
+    wanted = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+    if not hasattr(value, "shape"):
+        raise UserError(f"{what} is a {type(value).__name__}; expected an array of shape {wanted}")
+    if value.shape != shape:
+        raise UserError(f"{what} has the shape {value.shape}; expected {wanted}")
 
 
 def _check_duration(task: Task, seconds: float) -> None:

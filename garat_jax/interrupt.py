@@ -13,7 +13,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from types import CodeType, FrameType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -80,6 +80,14 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def _is_ours_to_take(number: int, handler: Any) -> bool:
+    """Say whether a signal is neither ignored nor, as SIGTERM by job schedulers, used already."""
+    if handler in (signal.SIG_IGN, None):
+        return False
+    is_ours = getattr(handler, "__module__", None) == __name__  # an outer block's
+    return number == signal.SIGINT or handler == signal.SIG_DFL or is_ours
+
+
 @contextlib.contextmanager
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     """Handle signals; none that is ignored, as in a script's background, and none in a thread."""
@@ -87,7 +95,7 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[No
         yield
         return
     previous = {number: signal.getsignal(number) for number in SIGNALS}
-    previous = {n: old for n, old in previous.items() if old not in (signal.SIG_IGN, None)}
+    previous = {number: old for number, old in previous.items() if _is_ours_to_take(number, old)}
     for number in previous:
         signal.signal(number, handler)
     try:

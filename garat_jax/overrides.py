@@ -19,8 +19,8 @@ OPTION_WORDS = {
 }
 """Options that MJCF gives as a word and MuJoCo as a number."""
 
-LED = ("friction", "damping", "stiffness", "gear", "gainprm", "size")
-"""Fields of several numbers of which the first says most: one number alone is that, as in MJCF."""
+LED = ("friction", "damping", "stiffness", "gear", "gainprm", "dynprm", "size")
+"""Fields of several numbers of which the first says most: one number alone is that."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Override:
             is given explicitly or comes from the body's geoms.
         value: The new value; of an option that is a word in MJCF, as `integrator`, the word or
             MuJoCo's number. Of a field of several numbers all of them; the first alone will do for
-            `friction`, `damping`, `stiffness`, `gear`, `gainprm` and `size`.
+            `friction`, `damping`, `stiffness`, `gear`, `gainprm`, `dynprm` and `size`.
     """
 
     element: str

@@ -292,29 +292,45 @@ def earlier_run_kept(root: Path) -> Iterator[None]:
         raise EarlierRunStays(f"the earlier run stays in {root}") from None
     finally:
         if _holds_results(root):
-            shutil.rmtree(aside)
+            shutil.rmtree(aside, ignore_errors=True)
         else:
             shutil.rmtree(root, ignore_errors=True)
             aside.rename(root)
 
 
-def put_back_earlier(root: Path) -> None:
+def put_back_earlier(root: Path) -> bool:
     """Do what a process that was killed could not: put the run back that it was to replace.
 
     Where it had results, the run that they replaced goes.
 
     Args:
         root: The folder of the run.
+
+    Returns:
+        Whether a run was put back.
+
+    Raises:
+        UserError: Something of the user's lies there now.
     """
     root = Path(os.path.abspath(root))
     aside = _aside(root)
-    if not aside.exists():
-        return
-    if is_run(root) and _holds_results(root):
+    if not aside.is_dir():
+        return False
+    contents = root / CONTENTS
+    written = contents.read_text(encoding="utf-8").splitlines() if contents.exists() else [CONFIG]
+    others = {path.name for path in root.glob("[!.]*")}.difference(written)
+    if others or root.is_symlink() or Path.cwd().resolve().is_relative_to(root.resolve()):
+        raise UserError(
+            f"{aside} holds the run that was to be replaced by one that was killed, in {root}, "
+            "where there is something else now, so both are left alone; move one of them away"
+        )
+    results = [root / name for name in written if name != CONFIG]
+    if any(path.is_file() or any(p.is_file() for p in path.rglob("*")) for path in results):
         shutil.rmtree(aside)
-    elif is_run(root) or not _is_occupied(root):
-        shutil.rmtree(root, ignore_errors=True)
-        aside.rename(root)
+        return False
+    shutil.rmtree(root, ignore_errors=True)
+    aside.rename(root)
+    return True
 
 
 def _aside(root: Path) -> Path:

@@ -136,7 +136,7 @@ def write_report(run: RunDirectory, summary: Mapping[str, Any], difference: str)
 
 
 def lead(summary: Mapping[str, Any]) -> str:
-    """Say in one sentence what came out."""
+    """Say in two sentences what came out."""
     mean = summary["scaled"]["mean"]
     ratio = np.mean(summary["error_ratio"])
     if mean is None:
@@ -163,7 +163,8 @@ def _beside_controls(summary: Mapping[str, Any]) -> str:
     if len(lead) == 1:
         return f"{beside}; one seed cannot tell whether that is chance."
     half = stats.t.ppf(0.975, len(lead) - 1) * lead.std(ddof=1) / np.sqrt(len(lead))
-    if lead.mean() > half:
+    shows = round(summary["scaled"]["mean"], 2) > round(scaled[name]["mean"], 2)
+    if shows and lead.mean() > half:
         return f"{beside}: the difference is the work of grounding."
     return f"{beside}: these seeds do not show that it is grounding that helps."
 

@@ -156,7 +156,7 @@ class Trainer:
         folder = self.run.path(f"checkpoints/{stage}")
         saved = reported = time.monotonic()
         progress = (first, state)  # one name, so that an interrupt never parts the two
-        is_over = first >= num_iterations
+        is_over, is_finished = first >= num_iterations, False
         try:
             with deferred_interrupt() as interrupted:
                 while not is_over and not interrupted():
@@ -179,7 +179,7 @@ class Trainer:
             self._keep(stage, *progress, is_over)
             raise
         self._keep(stage, *progress, is_over)
-        self._report(stage, progress[0], progress[0], None)
+        self._report(stage, progress[0], progress[0], None, is_finished)
         return progress[1]
 
     def _keep(self, stage: str, iteration: int, state, is_over: bool) -> None:
@@ -193,9 +193,10 @@ class Trainer:
         if latest is None or iteration > latest:
             checkpoint.save(folder, iteration, state)
 
-    def _report(self, stage: str, iteration: int, of: int, metrics) -> None:
+    def _report(self, stage: str, iteration: int, of: int, metrics, is_solved=False) -> None:
         if metrics is None:
-            self.console.print(f"{stage}: done after {iteration} iterations")
+            how = "solved by every seed" if is_solved else "done"
+            self.console.print(f"{stage}: {how} after {iteration} iterations")
             return
         shown = [
             f"{SHOWN[name]} {value.mean():,.4g}" for name, value in metrics.items() if name in SHOWN

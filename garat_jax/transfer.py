@@ -100,8 +100,7 @@ class TransferConfig:
         """Refuse what would fail after hours."""
         least = {"seeds": 1, "num_episodes": 1, "num_solving_episodes": 1}
         least |= dict.fromkeys(("num_updates", "num_retraining", "first_seed"), 0)
-        each = self.agent.num_envs  # as many transitions are one step
-        least |= dict.fromkeys(("num_target_transitions", "num_curve_transitions"), each)
+        least |= {"num_curve_transitions": 1, "num_target_transitions": self.agent.num_envs}
         for name, number in least.items():
             if getattr(self, name) < number:
                 raise UserError(f"{name} is {getattr(self, name)}; expected {number} or more")

@@ -7,7 +7,7 @@ import pytest
 
 from garat_jax import cli
 from garat_jax.commandline import how_to_go_on, parse
-from garat_jax.commands.console import writing
+from garat_jax.commands.console import make_run, writing
 from garat_jax.errors import DivergedError, UserError, nearest, unknown_name
 from garat_jax.runs import RunDirectory, earlier_run_kept
 from tests.test_split import free_port
@@ -160,6 +160,23 @@ def test_an_interrupt_says_how_to_go_on(failing, capsys):
     assert cli.main(["fail", "--how", "interrupt", "--force"]) == 130
     line = capsys.readouterr().err
     assert line == "garat: interrupted; go on with: garat fail --how interrupt --resume\n"
+
+
+def test_a_run_that_a_killed_process_was_to_replace_is_put_back(tmp_path, monkeypatch, capsys):
+    RunDirectory.create(tmp_path / ".run.replaced", {}, "garat fail", [0]).log(1, loss=0.5)
+    RunDirectory.create(tmp_path / "run", {}, "garat fail", [0])
+
+    def fail(self):
+        with make_run(self, tmp_path / "run"):
+            raise UserError("wrong input")
+
+    monkeypatch.setattr(Failing, "run", fail)
+    monkeypatch.setitem(cli.COMMANDS, "fail", Failing)
+    assert cli.main(["fail", "--force"]) == 2
+    assert f"put the run back in {tmp_path / 'run'} that" in capsys.readouterr().err
+    run = RunDirectory.open(tmp_path / "run")
+    assert [entry["loss"] for entry in run.metrics()] == [0.5]
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 def test_an_interrupt_before_a_replacement_has_results_leaves_the_earlier_run(

@@ -11,7 +11,7 @@ from garat_jax.errors import UserError
     ["nonsense", "localhost:", "localhost:abc", "localhost:99999999", "localhost:0", ":1234"],
 )
 def test_an_address_that_is_none_is_refused(address, monkeypatch):
-    message = "expected HOST:PORT, as node1:1234"
+    message = "^the coordinator is .*; expected HOST:PORT, as node1:1234$"
     with pytest.raises(UserError, match=message):
         devices.join_processes(address, 1, 0)
     monkeypatch.setenv("JAX_COORDINATOR_ADDRESS", address)

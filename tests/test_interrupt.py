@@ -69,6 +69,24 @@ def test_errors_that_no_interrupt_made_stay_what_they_are():
         raise RuntimeError("no memory")
 
 
+def test_a_handler_of_the_users_own_for_sigterm_stays():
+    came = []
+    before = signal.signal(signal.SIGTERM, lambda *_: came.append(1))
+    try:
+        with deferred_interrupt() as interrupted:
+            press(signal.SIGTERM)
+            assert came == [1]
+            assert not interrupted()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_an_inner_block_takes_sigterm_from_an_outer_one():
+    with pytest.raises(KeyboardInterrupt), interruptible(), deferred_interrupt() as interrupted:
+        press(signal.SIGTERM)
+        assert interrupted()
+
+
 @pytest.mark.parametrize("block", [interruptible, deferred_interrupt])
 def test_an_ignored_interrupt_stays_ignored(block):
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

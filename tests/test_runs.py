@@ -104,13 +104,25 @@ def test_an_earlier_run_goes_where_a_killed_process_had_results(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-def test_what_a_killed_process_left_beside_other_files_stays(tmp_path):
+@pytest.mark.parametrize("is_begun", [False, True])
+def test_what_a_killed_process_left_beside_other_files_stays(tmp_path, is_begun):
     create(tmp_path / ".run.replaced").log(1, loss=1.0)
-    (tmp_path / "run").mkdir()
+    if is_begun:
+        create(tmp_path / "run")
+    (tmp_path / "run").mkdir(exist_ok=True)
     (tmp_path / "run" / "thesis.tex").write_text("years of work")
-    put_back_earlier(tmp_path / "run")
+    with pytest.raises(UserError, match=r"run\.replaced holds the run that was to be replaced"):
+        put_back_earlier(tmp_path / "run")
     assert sorted(path.name for path in tmp_path.iterdir()) == [".run.replaced", "run"]
     assert (tmp_path / "run" / "thesis.tex").exists()
+
+
+def test_a_file_that_a_killed_process_had_not_finished_is_no_result(tmp_path):
+    create(tmp_path / ".run.replaced").log(1, loss=1.0)
+    create(tmp_path / "run", seeds=[7]).path("stages/one.json")
+    (tmp_path / "run" / ".seconds.json.123.tmp").write_text("{")
+    assert put_back_earlier(tmp_path / "run")
+    assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1
 
 
 def test_force_replaces_a_run(tmp_path):

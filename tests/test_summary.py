@@ -146,6 +146,7 @@ def test_when_no_seed_is_meaningful_there_is_no_mean_and_the_report_says_so(run)
     [
         ([1000.0, 990.0, 1000.0], [190.0, 200.0, 150.0], "the difference is the work of grounding"),
         ([1000.0, 990.0, 1000.0], [980.0, 995.0, 970.0], "do not show that it is grounding that"),
+        ([1000.0] * 3, [999.0] * 3, "reaches 1.00: these seeds do not show that it is grounding"),
         ([1000.0], [190.0], "reaches 0.10; one seed cannot tell whether that is chance"),
     ],
 )

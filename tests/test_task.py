@@ -1,11 +1,14 @@
 """A user's task is checked when its world is made, and an action when it is taken."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from garat_jax import rollout
 from garat_jax.env import make_world
 from garat_jax.errors import UserError
 from tests import models
@@ -36,6 +39,14 @@ def test_lengths_are_whole_numbers_from_1(arm, settings, said):
     [
         ("initial", (jnp.zeros(3), jnp.zeros(2)), r"qpos of Task\.initial has the shape \(3,\); "),
         ("initial", (jnp.zeros(2), jnp.zeros(())), r"qvel of Task\.initial has the shape \(\); "),
+        ("initial", ([0.0, 0.0], [0.0, 0.0]), r"qpos of Task\.initial is a list; expected an arr"),
+        ("observe", (jnp.zeros(2), jnp.zeros(2)), r"Task\.observe returns is a tuple; expected an"),
+        (
+            "reward",
+            None,
+            r"what Task\.reward returns is a NoneType; expected an array of shape \(\)",
+        ),
+        ("terminated", None, r"Task\.terminated returns is a NoneType; expected an array of sh"),
         ("initial", jnp.zeros(4), r"Task\.initial returns ShapeDtypeStruct; expected \(qpos, qv"),
         ("observe", jnp.zeros(()), r"Task\.observe returns has the shape \(\); expected \(obs_siz"),
         ("reward", jnp.zeros(2), r"Task\.reward returns has the shape \(2,\); expected \(\)"),
@@ -49,8 +60,23 @@ def test_what_a_task_returns_is_checked(arm, method, returned, said):
 
 
 def test_numbers_will_do_for_rewards_and_ends(arm):
-    plain = type("Plain", (Hang,), {"reward": lambda *_: 1.0, "terminated": lambda *_: False})
-    assert make_world(plain(arm), engine="mujoco").env.obs_size == 4
+    plain = type("Plain", (Hang,), {"reward": lambda *_: 1, "terminated": lambda *_: False})
+    world = make_world(plain(arm), engine="mujoco")
+
+    def still(params, obs, key):
+        return jnp.zeros(2), jnp.zeros(())
+
+    returns, _ = rollout.evaluate(world.env, world.params, still, (), jax.random.key(0), 3)
+    assert returns.tolist() == [20.0] * 3
+
+
+@pytest.mark.parametrize("limits", ['ctrllimited="true" ctrlrange="-0.4 0.4"', ""])
+def test_actions_may_be_whole_numbers_or_a_list(tmp_path, limits):
+    (tmp_path / "arm.xml").write_text(re.sub("<(position|motor) ", rf"<\1 {limits} ", models.ARM))
+    env = make_world(Hang(tmp_path / "arm.xml"), engine="mujoco").env
+    most = 0.4 if limits else 1.0
+    for action in (jnp.asarray([1, -1]), [1, -1], jnp.asarray([1, -1], jnp.bfloat16)):
+        np.testing.assert_allclose(env.clip(action), [most, -most], rtol=1e-6)
 
 
 def test_an_action_of_another_size_is_refused(arm):

@@ -75,8 +75,8 @@ def make_run(
     }
     line = shlex.join([PROGRAM, *sys.argv[1:]])
     replaces = command.force and not resume
-    if command.force or resume:
-        put_back_earlier(out)
+    if (command.force or resume) and put_back_earlier(out):
+        complain(f"put the run back in {out} that one which was killed was to replace", 0)
     if replaces:
         _check_outside(command, out)
     with earlier_run_kept(out) if replaces else contextlib.nullcontext():

@@ -1,7 +1,9 @@
 """The command `garat ground`: read the files, learn, write the run with its report."""
 
+import contextlib
 import dataclasses
 import hashlib
+import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, load_model, save_card
 from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.report_data import side_by_side_section
+from garat_jax.effects import CATALOGUE
 from garat_jax.effects.catalogue import Catalogue, line_in, run_python
 from garat_jax.errors import UserError
 from garat_jax.ground.learn import Grounded, ground
@@ -65,6 +68,10 @@ def run_ground(
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
     acting = load_policy(policy, loaded, recordings) if policy else None
     files = [model, *data, *holdout, *(path for path in (columns, policy) if path)]
+    for kind, law in (catalogue or {}).items():
+        if kind not in CATALOGUE:
+            with contextlib.suppress(OSError, TypeError):  # it was written in a notebook
+                files.append(Path(inspect.getfile(law)))
     run.record_settings({**to_plain(config), "contents": _contents(loaded, files)})
     done = ground(
         loaded,
@@ -86,7 +93,10 @@ def run_ground(
 
 
 def _contents(model: Model, files: Sequence[Path]) -> dict[str, str]:
-    """Return a digest of each file and of the compiled model: a resumed run has the same."""
+    """Return a digest of each file and of the compiled model: a resumed run has the same.
+
+    What a policy or a law of the user's own reads itself is not among them.
+    """
     digests = {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
     compiled = model.compile(engine="mujoco").host.digest
     return {path: digest[:16] for path, digest in {**digests, "compiled model": compiled}.items()}
