@@ -161,9 +161,9 @@ def test_evaluate_steps_no_episode_beyond_its_end(monkeypatch):
     steps = []
     advance = HostModel._advance_batch
 
-    def counted(self, num_substeps, batch, controls, ids):
-        steps.append(len(controls) if ids is None else len(ids))
-        return advance(self, num_substeps, batch, controls, ids)
+    def counted(self, num_substeps, batch, controls, finite):
+        steps.append(len(controls) if finite is None else int(finite.sum()))
+        return advance(self, num_substeps, batch, controls, finite)
 
     monkeypatch.setattr(HostModel, "_advance_batch", counted)
     world = make_world(InvertedPendulum(), engine="mujoco")
