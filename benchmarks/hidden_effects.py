@@ -32,8 +32,8 @@ from garat_jax.diagnosis import diagnose, load_model
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE
+from garat_jax.plain import finite_or_null, to_plain
 from garat_jax.provenance import git_state
-from garat_jax.runs import finite_or_null, to_plain
 
 NAME = "hidden_effects"
 """What the names of the result files begin with."""

@@ -18,7 +18,8 @@ from garat_jax.diagnosis.compare import read_recordings, tell
 from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.model_card import load_model
 from garat_jax.diagnosis.report import diagnosis_sections, write_diagnosis
-from garat_jax.runs import RunDirectory, finite_or_null, to_plain
+from garat_jax.plain import finite_or_null, to_plain
+from garat_jax.runs import RunDirectory
 
 CASES = {
     "free_pendulum": ("free_pendulum", None),

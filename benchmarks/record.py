@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from garat_jax.plain import to_plain
 from garat_jax.provenance import provenance
-from garat_jax.runs import to_plain
 
 FORMAT = "garat-benchmark/1"
 RESULTS = Path(__file__).resolve().parent / "results"

@@ -8,7 +8,6 @@ logged step), and whatever the command adds to it: summaries, checkpoints, plots
 import contextlib
 import dataclasses
 import json
-import math
 import os
 import shlex
 import shutil
@@ -16,14 +15,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from garat_jax.errors import EarlierRunStays, UserError
+from garat_jax.plain import finite_or_null, to_plain
 from garat_jax.provenance import provenance, versions
 
 FORMAT = "garat-run/1"
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
+SECONDS = "seconds.json"
+"""How long the run has taken so far."""
 CONTENTS = ".contents"
 """Names at the top of the folder that the run has written, a line each: others are the user's."""
 
@@ -229,40 +229,6 @@ def _parsed(text: str, path: Path) -> Any:
         raise UserError(f"{path} is damaged ({error}); start anew with --force") from error
 
 
-def to_plain(value: Any) -> Any:
-    """Turn a value into what JSON knows: dicts with string keys, lists, strings, numbers, None.
-
-    Raises:
-        TypeError: The value has no such form.
-    """
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    if isinstance(value, Path):
-        return str(value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): to_plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [to_plain(item) for item in value]
-    array = np.asarray(value)
-    if array.dtype == object:
-        raise TypeError(
-            f"{type(value).__name__} has no JSON form; "
-            "expected numbers, strings, arrays, paths, dataclasses or containers of them"
-        )
-    return array.tolist()
-
-
-def finite_or_null(value: Any) -> Any:
-    """Replace each NaN and infinity in a plain value by None."""
-    if isinstance(value, dict):
-        return {key: finite_or_null(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [finite_or_null(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 @contextlib.contextmanager
 def earlier_run_kept(root: Path) -> Iterator[None]:
     """Keep the run that a folder holds until another one has results in its place.
@@ -324,7 +290,7 @@ def put_back_earlier(root: Path) -> bool:
             f"{aside} holds the run that was to be replaced by one that was killed, in {root}, "
             "where there is something else now, so both are left alone; move one of them away"
         )
-    results = [root / name for name in written if name != CONFIG]
+    results = [root / name for name in written if name not in (CONFIG, SECONDS)]
     if any(path.is_file() or any(p.is_file() for p in path.rglob("*")) for path in results):
         shutil.rmtree(aside)
         return False
@@ -340,7 +306,7 @@ def _aside(root: Path) -> Path:
 
 def _holds_results(root: Path) -> bool:
     """Say whether there is more in a run directory than how it was begun."""
-    begun = (root / CONFIG, root / CONTENTS)
+    begun = (root / CONFIG, root / CONTENTS, root / SECONDS)
     return any(path.is_file() and path not in begun for path in root.rglob("*"))
 
 

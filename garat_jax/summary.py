@@ -8,8 +8,9 @@ import plotly.graph_objects as go
 from scipy import stats
 
 from garat_jax import report
+from garat_jax.plain import to_plain
 from garat_jax.report import Fact, Figure, Section, Table
-from garat_jax.runs import RunDirectory, to_plain
+from garat_jax.runs import RunDirectory
 
 SOURCE_FRACTION = 0.3
 """A seed is meaningful only if its source policy gets less than this share of the target's."""

@@ -16,7 +16,7 @@ from garat_jax.devices import peak_mebibytes
 from garat_jax.errors import DivergedError, UserError
 from garat_jax.interrupt import deferred_interrupt
 from garat_jax.rollout import Fault
-from garat_jax.runs import RunDirectory
+from garat_jax.runs import SECONDS, RunDirectory
 from garat_jax.types import Metrics
 
 State = TypeVar("State")
@@ -34,8 +34,6 @@ SHOWN = {
     "error_ratio": "error of one step, share of the source's",
 }
 """Metrics that are printed, and what they are called there."""
-
-SECONDS = "seconds.json"
 
 
 def _console() -> Console:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from garat_jax.errors import UserError
+from garat_jax.plain import to_plain
 from garat_jax.provenance import git_state, provenance
-from garat_jax.runs import RunDirectory, earlier_run_kept, put_back_earlier, to_plain
+from garat_jax.runs import RunDirectory, earlier_run_kept, put_back_earlier
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +61,14 @@ def test_an_earlier_run_stays_where_the_next_one_has_no_results(tmp_path):
     assert run.read_json("config.json")["seeds"] == [0, 1]
     assert len(list(run.metrics())) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_the_time_that_compiling_took_is_no_result(tmp_path):
+    create(tmp_path / "run").log(1, loss=1.0)
+    with pytest.raises(UserError), earlier_run_kept(tmp_path / "run"):
+        create(tmp_path / "run", seeds=[7]).write_json("seconds.json", {"compile": 20.0})
+        raise UserError("wrong input")
+    assert RunDirectory.open(tmp_path / "run").read_json("config.json")["seeds"] == [0, 1]
 
 
 def test_an_earlier_run_goes_where_the_next_one_has_results(tmp_path):
@@ -119,7 +128,9 @@ def test_what_a_killed_process_left_beside_other_files_stays(tmp_path, is_begun)
 
 def test_a_file_that_a_killed_process_had_not_finished_is_no_result(tmp_path):
     create(tmp_path / ".run.replaced").log(1, loss=1.0)
-    create(tmp_path / "run", seeds=[7]).path("stages/one.json")
+    run = create(tmp_path / "run", seeds=[7])
+    run.path("stages/one.json")
+    run.write_json("seconds.json", {"compile": 20.0})  # of the first program
     (tmp_path / "run" / ".seconds.json.123.tmp").write_text("{")
     assert put_back_earlier(tmp_path / "run")
     assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1

@@ -13,7 +13,7 @@ from scipy import signal
 
 from garat_jax.diagnosis.hidden import write_csv
 from garat_jax.effects import CATALOGUE
-from garat_jax.runs import to_plain
+from garat_jax.plain import to_plain
 
 from .bodies import CATALOGUED, SECRETS
 from .measure import Eye, experiment, measure

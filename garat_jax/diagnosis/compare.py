@@ -39,8 +39,9 @@ from garat_jax.diagnosis.unseen import STILL, is_still
 from garat_jax.dynamics import native_model
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.effects.elements import element_names
+from garat_jax.plain import finite_or_null, to_plain
 from garat_jax.provenance import versions
-from garat_jax.runs import RunDirectory, finite_or_null, to_plain
+from garat_jax.runs import RunDirectory
 
 FORMAT = "garat-compare/1"
 

@@ -31,8 +31,9 @@ from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.view import repaired
 from garat_jax.effects.catalogue import Catalogue
+from garat_jax.plain import finite_or_null, to_plain
 from garat_jax.report import Reproduce, Section, Table
-from garat_jax.runs import RunDirectory, finite_or_null, to_plain
+from garat_jax.runs import RunDirectory
 
 FORMAT = "garat-improve/1"
 ROUNDS = 4

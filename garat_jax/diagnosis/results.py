@@ -21,7 +21,7 @@ from garat_jax.diagnosis.judge import NIL, NO_CERTAIN_LEAD, SMALLEST_SHARE, TOO_
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.metric import ABOVE_FLOOR
 from garat_jax.errors import choose
-from garat_jax.runs import finite_or_null, to_plain
+from garat_jax.plain import finite_or_null, to_plain
 
 FORMAT = "garat-diagnosis/1"
 OFFER = (

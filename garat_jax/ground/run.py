@@ -25,8 +25,9 @@ from garat_jax.effects.catalogue import Catalogue, line_in, run_python
 from garat_jax.errors import UserError
 from garat_jax.ground.learn import Grounded, ground
 from garat_jax.ground.source import CARD, SUMMARY
+from garat_jax.plain import finite_or_null, to_plain
 from garat_jax.report import Fact, Figure, Reproduce, Section
-from garat_jax.runs import RunDirectory, finite_or_null, to_plain
+from garat_jax.runs import RunDirectory
 from garat_jax.transfer import GroundConfig
 from garat_jax.types import Params, Policy
 
