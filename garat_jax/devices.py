@@ -84,15 +84,12 @@ def join_processes(
     # It would take SIGTERM, for those who ask it; here Python's handler ends the run.
     jax.config.update("jax_enable_preemption_service", False)
     address = coordinator or os.environ.get("JAX_COORDINATOR_ADDRESS")
+    number = _or_variable(process, "JAX_PROCESS_ID")
+    count = _or_variable(num_processes, "JAX_NUM_PROCESSES")
+    if address:
+        _check_address(address, wait=bool(number))
     try:
-        number = _or_variable(process, "JAX_PROCESS_ID")
-        if address:
-            _check_address(address, wait=bool(number))
-        jax.distributed.initialize(
-            coordinator, _or_variable(num_processes, "JAX_NUM_PROCESSES"), number
-        )
-    except UserError:
-        raise
+        jax.distributed.initialize(coordinator, count, number)
     except (RuntimeError, ValueError) as error:
         raise UserError(
             f"the processes do not come together: {error}; give --coordinator HOST:PORT, "
@@ -125,7 +122,11 @@ def _check_address(address: str, wait: bool) -> None:
 
 def _or_variable(number: int | None, variable: str) -> int | None:
     text = os.environ.get(variable)
-    return int(text) if number is None and text else number
+    if number is not None or not text:
+        return number
+    if not text.strip().isdecimal():
+        raise UserError(f"the variable {variable} is {text!r}; expected a whole number")
+    return int(text)
 
 
 def is_of_devices(error: AssertionError | RuntimeError) -> bool:

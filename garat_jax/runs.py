@@ -290,8 +290,7 @@ def put_back_earlier(root: Path) -> bool:
             f"{aside} holds the run that was to be replaced by one that was killed, in {root}, "
             "where there is something else now, so both are left alone; move one of them away"
         )
-    results = [root / name for name in written if name not in (CONFIG, SECONDS)]
-    if any(path.is_file() or any(p.is_file() for p in path.rglob("*")) for path in results):
+    if _holds_results(root):
         shutil.rmtree(aside)
         return False
     shutil.rmtree(root, ignore_errors=True)
@@ -305,9 +304,9 @@ def _aside(root: Path) -> Path:
 
 
 def _holds_results(root: Path) -> bool:
-    """Say whether there is more in a run directory than how it was begun."""
-    begun = (root / CONFIG, root / CONTENTS, root / SECONDS)
-    return any(path.is_file() and path not in begun for path in root.rglob("*"))
+    """Say whether there is more in a run directory than how it was begun, and hidden files."""
+    begun = (root / CONFIG, root / SECONDS)
+    return any(path.is_file() and path not in begun for path in root.rglob("[!.]*"))
 
 
 def _is_occupied(root: Path) -> bool:

@@ -177,7 +177,8 @@ class Trainer:
             self._keep(stage, *progress, is_over)
             raise
         self._keep(stage, *progress, is_over)
-        self._report(stage, progress[0], progress[0], None, is_finished)
+        how = "solved by every seed" if is_finished else "done"
+        self.console.print(f"{stage}: {how} after {progress[0]} iterations")
         return progress[1]
 
     def _keep(self, stage: str, iteration: int, state, is_over: bool) -> None:
@@ -191,11 +192,7 @@ class Trainer:
         if latest is None or iteration > latest:
             checkpoint.save(folder, iteration, state)
 
-    def _report(self, stage: str, iteration: int, of: int, metrics, is_solved=False) -> None:
-        if metrics is None:
-            how = "solved by every seed" if is_solved else "done"
-            self.console.print(f"{stage}: {how} after {iteration} iterations")
-            return
+    def _report(self, stage: str, iteration: int, of: int, metrics) -> None:
         shown = [
             f"{SHOWN[name]} {value.mean():,.4g}" for name, value in metrics.items() if name in SHOWN
         ]

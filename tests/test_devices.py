@@ -26,3 +26,10 @@ def test_a_process_0_that_never_answers_is_named(monkeypatch):
         address = f"127.0.0.1:{unused.getsockname()[1]}"
         with pytest.raises(UserError, match=f"no process 0 answers at {address}"):
             devices.join_processes(address, 2, 1)
+
+
+@pytest.mark.parametrize("variable", ["JAX_PROCESS_ID", "JAX_NUM_PROCESSES"])
+def test_a_variable_that_is_no_number_is_refused(variable, monkeypatch):
+    monkeypatch.setenv(variable, "two")
+    with pytest.raises(UserError, match=f"^the variable {variable} is 'two'; expected a whole"):
+        devices.join_processes("127.0.0.1:1234", None, None)
