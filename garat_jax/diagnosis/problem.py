@@ -116,9 +116,11 @@ class Problem(Generic[AnySimulator]):
 
     def num_tried(self, effect: int) -> int:
         """Return how many sizes of an effect were looked at, for the correction of its p-value."""
-        suggestion = self.suggested.get(effect)
+        law, suggestion = self.simulator.effects[effect], self.suggested.get(effect)
         more = suggestion.num_tried if suggestion is not None else 0
-        return self.num_listed(effect) + more
+        num_listed = self.num_listed(effect)
+        has_one = num_listed == 1 and law.independent  # that of each of its parameters
+        return more + (len(law.parameters()) if has_one else num_listed)
 
     def take(self, chosen: np.ndarray) -> "Problem[AnySimulator]":
         """Return the problem of some of the segments."""

@@ -163,7 +163,7 @@ def _measure(
             rows[index], trials[index] = larger[index]
             changes[:, index] = new
     num_firsts = len(rows)
-    best = best_sizes(trials, weight[:, None] * changes, weight * residual)
+    best = best_sizes(simulator, rows, trials, weight[:, None] * changes, weight * residual)
     rows, trials = others(simulator, theta, rows, best)
     if more := rows[num_firsts:]:
         below = [changes[:, row.below] if row.below >= 0 else 0.0 * residual for row in more]

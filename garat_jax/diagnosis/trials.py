@@ -42,6 +42,7 @@ class Trial(NamedTuple):
         start: What "tried" sets, by column.
         rows: Indices of the rows that move one parameter each, the first parameter's first.
         is_only: Whether it is the one size that the law lists; then sizes are extrapolated from it.
+            Each parameter that acts alone has one such trial.
     """
 
     effect: int
@@ -51,7 +52,11 @@ class Trial(NamedTuple):
 
 
 def firsts(problem: Problem[Simulator], theta: np.ndarray, skip) -> tuple[list[Row], list[Trial]]:
-    """List each candidate at each of its sizes, a row for each."""
+    """List each candidate at each of its sizes, a row for each.
+
+    Where one size of one parameter is all that a law lists, and its parameters act alone, each of
+    them has a trial: any may be the one that the recordings show.
+    """
     simulator = problem.simulator
     rows: list[Row] = []
     trials = []
@@ -64,12 +69,14 @@ def firsts(problem: Problem[Simulator], theta: np.ndarray, skip) -> tuple[list[R
         for place, given in enumerate(_sizes(problem, theta, index, columns)):
             start = {names[name]: value for name, value in given.items()}
             is_only = has_one and place == 0
+            several = [start]
             if is_only and len(start) == 1:
-                step = _step_within(simulator, columns[0], theta[columns[0]])
-                start = {columns[0]: theta[columns[0]] + step}
-            moved = next(j for j in columns if j in start)
-            trials.append(Trial(index, start, (len(rows),), is_only))
-            rows.append(Row(moved, start, start[moved] - theta[moved], -1))
+                moved = columns if simulator.effects[index].independent else columns[:1]
+                several = [{j: theta[j] + _step_within(simulator, j, theta[j])} for j in moved]
+            for start in several:
+                moved = next(j for j in columns if j in start)
+                trials.append(Trial(index, start, (len(rows),), is_only))
+                rows.append(Row(moved, start, start[moved] - theta[moved], -1))
     return rows, trials
 
 
@@ -89,27 +96,52 @@ def _sizes(problem: Problem[Simulator], theta: np.ndarray, index: int, columns: 
     return tuple({first.name: min(factor * size, first.high)} for factor in (0.5, 2.0))
 
 
-def best_sizes(trials: list[Trial], changes: np.ndarray, residual: np.ndarray) -> list[Trial]:
-    """Return each candidate's trial that explains most by itself, in the direction tried."""
+def best_sizes(
+    simulator: Simulator,
+    rows: list[Row],
+    trials: list[Trial],
+    changes: np.ndarray,
+    residual: np.ndarray,
+) -> list[Trial]:
+    """Return each candidate's trial that explains most by itself, in a way that is possible.
+
+    A size that is extrapolated lies within its bounds then; any other acts in the direction tried.
+
+    Args:
+        simulator: With all candidates.
+        rows: One a trial.
+        trials: The candidates at their sizes, in the order of the rows.
+        changes: What the rows change, [M, rows].
+        residual: [M].
+    """
     best: dict[int, tuple[tuple[bool, float], Trial]] = {}
-    for trial in trials:
-        change = changes[:, trial.rows[0]]
-        along = -float(change @ residual) / (float(np.linalg.norm(change)) or np.inf)
-        merit = (trial.is_only or along > 0, abs(along))
+    for row, trial, change in zip(rows, trials, changes.T, strict=True):
+        norm = float(np.linalg.norm(change)) or np.inf
+        along = -float(change @ residual) / norm
+        slot = simulator.slots[row.column].parameter
+        size = row.values[row.column] + (along / norm - 1.0) * row.step
+        merit = (slot.low <= size <= slot.high if trial.is_only else along > 0, abs(along))
         if trial.effect not in best or merit > best[trial.effect][0]:
             best[trial.effect] = (merit, trial)
     return [trial for _, trial in best.values()]
 
 
 def others(simulator: Simulator, theta: np.ndarray, rows: list[Row], trials: list[Trial]):
-    """Add a row for each further parameter of the trials; return all rows and the trials."""
+    """Add a row for each further parameter of the trials; return all rows and the trials.
+
+    Parameters that act alone, and had a trial each, have a row already.
+    """
     rows, extended = list(rows), []
+    had = {row.column: index for index, row in enumerate(rows)}
     for trial in trials:
         first, effect = trial.rows[0], simulator.effects[trial.effect]
         columns = list(columns_of(simulator.slots, trial.effect).values())
         chosen = [first]
         for j in columns:
             if j == rows[first].column:
+                continue
+            if trial.is_only and effect.independent and j in had:
+                chosen.append(had[j])
                 continue
             base = trial.start[j] if j in trial.start else float(theta[j])
             step = _step_within(simulator, j, base)

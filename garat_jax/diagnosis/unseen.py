@@ -11,7 +11,7 @@ from garat_jax.diagnosis.screen import SCREENED
 from garat_jax.diagnosis.segments import QUIET, Segments
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit
-from garat_jax.diagnosis.trials import Row, firsts, others
+from garat_jax.diagnosis.trials import Row, Trial, firsts
 from garat_jax.effects import Effect
 from garat_jax.effects.units import unit_at
 
@@ -51,8 +51,6 @@ def unseen(
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SCREENED)]
     rows, trials = firsts(problem, theta, ())
-    alone = [t for t in trials if t.is_only and simulator.effects[t.effect].independent]
-    rows, alone = others(simulator, theta, rows, alone)
     evidence = Evidence(problem, current, chosen)
 
     def size_of(rows: Sequence[Row]) -> np.ndarray:
@@ -63,12 +61,11 @@ def unseen(
         return np.linalg.norm(change, axis=0) * np.sqrt(len(fitted) / len(chosen))
 
     size = size_of(rows)
-    shown = {t.effect for t in (*trials, *alone) if size[list(t.rows)].max() > SEEN}
-    hidden = {
-        t.effect: t
-        for t in trials
-        if t.effect not in shown and not _is_shown(simulator.effects[t.effect], seen)
-    }
+    shown = {t.effect for t in trials if size[list(t.rows)].max() > SEEN}
+    hidden: dict[int, Trial] = {}
+    for t in trials:
+        if t.effect not in shown and not _is_shown(simulator.effects[t.effect], seen):
+            hidden.setdefault(t.effect, t)
     smooth = {i: t.rows[0] for i, t in hidden.items() if t.is_only and size[t.rows[0]] > 0}
     steps = {i: SEEN / size[first] * rows[first].step for i, first in smooth.items()}
     up_to = _enlarged(problem, {i: rows[first] for i, first in smooth.items()}, steps, size_of)

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis.metric import make_metric, trusted
-from garat_jax.diagnosis.screen import _measure
+from garat_jax.diagnosis.screen import _measure, screen
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.trials import enlarge, firsts
-from garat_jax.effects import TorqueOffset
+from garat_jax.effects import GravityTilt, TorqueOffset
+from tests.diagnosis import pendulum
 from tests.diagnosis.test_fit import UNIFORM, candidates, column, make_problem, record
 
 
@@ -61,6 +62,22 @@ def test_steps_grow_where_few_samples_make_the_change():
     changes[0, friction] = 1e3  # most samples do not change at all
     rare, _ = enlarge(problem, rows, trials, changes, np.full(1000, 5.0), every)[friction]
     assert rare.step == pytest.approx(5 * rows[friction].step)
+
+
+def test_of_parameters_that_act_alone_the_one_that_is_seen_comes_first():
+    def tilt(spec):
+        spec.option.gravity = [-9.81 * np.sin(0.05), 0.0, -9.81 * np.cos(0.05)]
+
+    problem = make_problem([pendulum.record(tilt, seed) for seed in range(2)], candidates())
+    simulator = problem.simulator
+    settled = settle(problem, simulator.base, problem.segments.start)
+    found = {simulator.effects[score.effect].kind: score for score in screen(problem, settled)}
+    roll = column(simulator, "gravity_tilt")  # to first order nothing, where all moves in a plane
+    assert found["gravity_tilt"].columns[0] == roll + 1
+    assert found["gravity_tilt"].possible
+    assert found["gravity_tilt"].size[0] == pytest.approx(0.05, abs=0.01)
+    tilts = [i for i, e in enumerate(simulator.effects) if isinstance(e, GravityTilt)]
+    assert [problem.num_tried(i) for i in tilts] == [2]
 
 
 def test_samples_that_half_a_timestep_changes_count_less_and_are_reported_as_they_are():
