@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 
 from garat_jax._mjx import mjx
-from garat_jax.effects.base import Effect, ModelView
+from garat_jax.effects import Effect, ModelView, in_order
 from garat_jax.effects.bounds import check_bounds
 from garat_jax.engine import HostModel
 from garat_jax.errors import UserError, unknown_name
@@ -84,7 +84,7 @@ def compile(
         spec: MuJoCo's editable model.
         overrides: Changes written into the spec; they pass through the compiler, so that every
             derived constant follows.
-        effects: Physical effects to add.
+        effects: Physical effects to add, in any order; they act `in_order`.
         engine: `mjx`, `mujoco`, or `auto`: C MuJoCo on a CPU and MJX elsewhere.
 
     Raises:
@@ -95,7 +95,7 @@ def compile(
         raise unknown_name("engine", engine, ENGINES)
     if engine == "auto":
         engine = "mujoco" if jax.default_backend() == "cpu" else "mjx"
-    spec = spec.copy()
+    spec, effects = spec.copy(), in_order(effects)
     for override in overrides:
         override.apply(spec)
     for effect in effects:
@@ -110,7 +110,7 @@ def compile(
         raise UserError(f"MuJoCo cannot compile the model: {error}") from error
     host = HostModel(native)
     model = put_model(host.model) if engine == "mjx" else None
-    as_arrays = jax.tree.map(jnp.asarray, tuple(effects))
+    as_arrays = jax.tree.map(jnp.asarray, effects)
     return Dynamics(effects=as_arrays, model=model, host=host, engine=engine)
 
 
@@ -171,7 +171,7 @@ def adopt(dynamics: Dynamics, state: PhysicsState) -> PhysicsState:
 def sensed(dynamics: Dynamics, state: PhysicsState) -> PhysicsState:
     """Return the state with the qpos and qvel that the sensors report; `sensordata` stays true.
 
-    The effects' order is the signal's: of a scale before an offset comes scale * q + offset.
+    A scale acts before an offset: of both comes scale * q + offset.
     """
     for effect, memory in zip(dynamics.effects, state.memory, strict=True):
         state = effect.sense(dynamics.host.model, state, memory)

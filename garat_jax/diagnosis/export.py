@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mujoco
 
 from garat_jax.diagnosis.model_card import Model
-from garat_jax.effects import Effect
+from garat_jax.effects import Effect, in_order
 from garat_jax.effects.joint import TorqueOffset
 from garat_jax.effects.transmission import Transmission
 from garat_jax.errors import UserError
@@ -48,7 +48,7 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
         override.apply(spec)
     unsaid = tuple(
         line if effect.kind in line else f"{effect.kind} at {effect.target}: {line}"
-        for effect in sorted(model.effects, key=_turn)
+        for effect in sorted(in_order(model.effects), key=_turn)
         if (line := effect.export(spec))
     )
     _point_at_assets(spec, model.mjcf.parent, path.parent)

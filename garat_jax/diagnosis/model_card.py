@@ -61,7 +61,7 @@ class Model:
     interval: float | None = None
 
     def compile(self, engine: str = "auto", extra_effects: Sequence[Effect] = ()) -> Dynamics:
-        """Compile the model, with more effects after its own; see `dynamics.compile`."""
+        """Compile the model, with more effects than its own; see `dynamics.compile`."""
         effects = (*self.effects, *extra_effects)
         try_own(self.spec, self.overrides, effects)
         return compile(self.spec, self.overrides, effects, engine)

@@ -27,7 +27,7 @@ from garat_jax.diagnosis.past import (
 from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
 from garat_jax.diagnosis.slots import Slot, columns_of
 from garat_jax.dynamics import Override
-from garat_jax.effects import Effect
+from garat_jax.effects import Effect, in_order
 from garat_jax.errors import UserError
 
 NUM_PROGRAMS, NUM_FINER = 40, 4
@@ -135,7 +135,7 @@ class Simulator:
         """
         with jax.enable_x64(True):
             world = self._model.compile(extra_effects=[self.effects[i] for i in chosen])
-        own = world.effects[: len(world.effects) - len(chosen)]
+            own = jax.tree.map(jnp.asarray, self._model.effects)
         return world.replace(effects=tuple(effect.as_replayed() for effect in own))
 
     def _is_memoryless(self, effect: Effect) -> bool:
@@ -303,7 +303,7 @@ class Simulator:
     def _with(self, world: dynamics.Dynamics, chosen: Sequence[int], theta) -> dynamics.Dynamics:
         """Return a world with some of the candidates, at the values of `theta`."""
         acting = (effect.as_replayed() for effect in self.with_parameters(theta, chosen))
-        return world.replace(effects=(*world.effects, *acting))
+        return world.replace(effects=in_order((*world.effects, *acting)))
 
     def _begin(self, world: dynamics.Dynamics, start, past, num_before: int):
         """Return a segment's start, remembering all commands but the last `num_before`."""

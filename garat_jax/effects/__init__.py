@@ -1,5 +1,7 @@
 """The catalogue of physical effects."""
 
+from collections.abc import Iterable
+
 from garat_jax.effects.actuator import BackEmf, MotorCurve, MotorGain, TorqueSaturation
 from garat_jax.effects.base import Effect, ModelView, Parameter, Suggestion, parameter
 from garat_jax.effects.body import AirDrag, ComOffset, PayloadMass
@@ -51,6 +53,19 @@ CATALOGUE: dict[str, type[Effect]] = {
     "sensor_delay": SensorDelay,
 }
 """Every kind by its name, in the order in which a command passes: laws see what came before."""
+LAST_BEFORE_OWN = "torque_saturation"
+"""The last kind that changes commands; a user's own follow it, before what looks at torques."""
+
+
+def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Return effects as they act one after the other: in the catalogue's order.
+
+    A card may list them as they were found. Those of one kind, and a user's own, stay as listed.
+    """
+    place = {kind: float(number) for number, kind in enumerate(CATALOGUE)}
+    own = place[LAST_BEFORE_OWN] + 0.5
+    return tuple(sorted(effects, key=lambda effect: place.get(effect.kind, own)))
+
 
 __all__ = [
     "CATALOGUE",
@@ -87,6 +102,7 @@ __all__ = [
     "TorqueOffset",
     "TorqueSaturation",
     "ViscousDamping",
+    "in_order",
     "parameter",
     "unit_at",
 ]
