@@ -53,6 +53,7 @@ class Evidence:
         nuisances = self.rest(np.stack([integrator, *_offsets(problem)]))
         self._integrator, self._offsets = nuisances[:, :1], nuisances[:, 1:]
         self._delay = self._common_delay(fit.free)
+        self._nuisances: dict[tuple[bool, bool], np.ndarray] = {}
 
     def change(self, thetas: np.ndarray) -> np.ndarray:
         """Return what parameters [k, num_parameters] change in the predictions, [M, k]."""
@@ -69,11 +70,19 @@ class Evidence:
             num_fitted: As for `wald_test`.
         """
         kind = self._problem.simulator.effects[effect].kind
-        nuisances = [self._integrator]
-        nuisances += [] if kind in DELAYS else [self._delay]
-        nuisances += [] if kind in OFFSETS else [self._offsets]
-        nuisance = orthonormal(np.concatenate(nuisances, axis=1))
+        nuisance = self._nuisance(kind not in DELAYS, kind not in OFFSETS)
         return wald_test(matrix, self.residual, nuisance, self._labels, num_fitted)
+
+    def _nuisance(self, with_delay: bool, with_offsets: bool) -> np.ndarray:
+        """Return what else may have made the residual, orthonormal, [M, n]; the same for many."""
+        if (found := self._nuisances.get((with_delay, with_offsets))) is not None:
+            return found
+        nuisances = [self._integrator]
+        nuisances += [self._delay] if with_delay else []
+        nuisances += [self._offsets] if with_offsets else []
+        nuisance = orthonormal(np.concatenate(nuisances, axis=1))
+        self._nuisances[with_delay, with_offsets] = nuisance
+        return nuisance
 
     def rest(self, columns: np.ndarray) -> np.ndarray:
         """Return changes [k, S, N] less what initial states and free parameters do, [M, k]."""
