@@ -69,11 +69,11 @@ def firsts(problem: Problem[Simulator], theta: np.ndarray, skip) -> tuple[list[R
         for place, given in enumerate(_sizes(problem, theta, index, columns)):
             start = {names[name]: value for name, value in given.items()}
             is_only = has_one and place == 0
-            several = [start]
+            tried = [start]
             if is_only and len(start) == 1:
-                moved = columns if simulator.effects[index].independent else columns[:1]
-                several = [{j: theta[j] + _step_within(simulator, j, theta[j])} for j in moved]
-            for start in several:
+                alone = columns if simulator.effects[index].independent else columns[:1]
+                tried = [{j: theta[j] + _step_within(simulator, j, theta[j])} for j in alone]
+            for start in tried:
                 moved = next(j for j in columns if j in start)
                 trials.append(Trial(index, start, (len(rows),), is_only))
                 rows.append(Row(moved, start, start[moved] - theta[moved], -1))
