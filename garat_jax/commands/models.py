@@ -166,6 +166,8 @@ def _assignments(texts: Sequence[str]) -> dict[str, float]:
 
 def _print_effect(effect: "type[Effect]") -> None:
     """Print what an effect does, and its parameters with units, bounds and their source."""
+    from garat_jax.effects.units import LEVER, at_slide
+
     say(f"{effect.kind}: {effect.law}\n\n{inspect.getdoc(effect)}\n")
     say(f"Acts on: {', '.join(effect.elements)}. Identified by: {effect.identified_by}.")
     rows = [
@@ -173,3 +175,5 @@ def _print_effect(effect: "type[Effect]") -> None:
         for p in effect.parameters()
     ]
     print_table(("parameter", "unit", "no effect", "bounds", "source of the bounds"), rows)
+    if "joint" in effect.elements and any(at_slide(p.unit) != p.unit for p in effect.parameters()):
+        say(f"At a slide joint bounds of forces are what they are at a lever of {LEVER:g} m.")

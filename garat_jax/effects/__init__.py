@@ -18,7 +18,7 @@ from garat_jax.effects.friction import (
 from garat_jax.effects.joint import CoggingTorque, JointStiffness, RotorInertia, TorqueOffset
 from garat_jax.effects.sensor import EncoderOffset, EncoderScale, SensorDelay
 from garat_jax.effects.transmission import Backlash, JointFlexibility
-from garat_jax.effects.units import unit_at
+from garat_jax.effects.units import parameter_at, unit_at
 from garat_jax.effects.world import GravityScale, GravityTilt
 
 CATALOGUE: dict[str, type[Effect]] = {
@@ -104,5 +104,6 @@ __all__ = [
     "ViscousDamping",
     "in_order",
     "parameter",
+    "parameter_at",
     "unit_at",
 ]

@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.effects.base import Effect
-from garat_jax.effects.units import unit_at
+from garat_jax.effects.units import parameter_at
 from garat_jax.errors import UserError
 
 ROUNDING = 1e-6
@@ -25,7 +25,7 @@ def check_bounds(effect: Effect, host: mujoco.MjModel) -> None:
         UserError: A value is outside its bounds, or not a number.
     """
     none = effect.at(host, effect.target)
-    for p in effect.parameters():
+    for p in (parameter_at(p, host, effect.target) for p in effect.parameters()):
         given = getattr(effect, p.name)
         if isinstance(given, jax.core.Tracer):
             continue
@@ -33,8 +33,7 @@ def check_bounds(effect: Effect, host: mujoco.MjModel) -> None:
         low, high = p.low - ROUNDING * abs(p.low), p.high + ROUNDING * abs(p.high)
         good = ((low <= values) & (values <= high)) | np.isclose(values, none[p.name], ROUNDING)
         if not np.all(good):
-            unit = unit_at(p, host, effect.target)
             raise UserError(
                 f"{effect.kind} {p.name} = {values[~good].flat[0]:g} is outside its bounds, "
-                f"{p.low:g} to {p.high:g}{f' {unit}' if unit else ''} ({p.source})"
+                f"{p.low:g} to {p.high:g}{f' {p.unit}' if p.unit else ''} ({p.source})"
             )

@@ -6,7 +6,13 @@ import mujoco
 import pytest
 
 from garat_jax import dynamics
-from garat_jax.effects import ActuatorDelay, ContactFriction, ViscousDamping
+from garat_jax.effects import (
+    CATALOGUE,
+    ActuatorDelay,
+    ContactFriction,
+    ViscousDamping,
+    parameter_at,
+)
 from garat_jax.errors import UserError
 from tests import models
 
@@ -47,3 +53,35 @@ def test_a_value_that_is_mapped_over_is_not_looked_at():
 
     base, more = jax.vmap(damping)(jnp.asarray([0.0, 0.5]))
     assert more - base == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "number", "unit", "high"),
+    [
+        ("coulomb_friction", 0, "N", 500.0),
+        ("viscous_damping", 0, "N s/m", 1e4),
+        ("quadratic_drag", 0, "N s²/m²", 1e4),
+        ("rotor_inertia", 0, "kg", 1e3),
+        ("joint_stiffness", 0, "N/m", 1e6),
+        ("stribeck_friction", 2, "m/s", 10.0),
+        ("joint_flexibility", 0, "N/m", 1e9),  # the bound means "no effect"
+        ("back_emf", 0, "N s/m", 1e4),
+    ],
+)
+def test_bounds_at_a_slide_are_a_hinges_at_a_lever(kind, number, unit, high):
+    host = models.spec(models.SLIDER).compile()
+    declared = CATALOGUE[kind].parameters()[number]
+    target = "actuator/push" if kind == "back_emf" else "joint/along"
+    there = parameter_at(declared, host, target)
+    assert there.unit == unit
+    assert there.high == pytest.approx(high)
+    hinge = models.spec(models.PENDULUM).compile()
+    turns = "actuator/motor" if kind == "back_emf" else "joint/hinge"
+    assert parameter_at(declared, hinge, turns) == declared
+
+
+def test_a_heavy_axis_may_have_more_damping_than_a_hinge():
+    axis = models.spec(models.SLIDER)
+    dynamics.compile(axis, effects=(ViscousDamping("joint/along", coefficient=250.0),))
+    with pytest.raises(UserError, match="0 to 10000 N s/m"):
+        dynamics.compile(axis, effects=(ViscousDamping("joint/along", coefficient=2e4),))
