@@ -147,7 +147,8 @@ def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, flo
     """
     cls = choose_kind(kind, model.catalogue)
     effect = make_effect(cls, target, values)
-    host = native_model(model.compile(engine="mujoco"))
+    bare = dataclasses.replace(model, effects=())  # an effect of the card is none of the model's
+    host = native_model(bare.compile(engine="mujoco"))
     effect.check(host)
     effect = effect.replace(**{**cls.at(host, target), **values})
     check_bounds(effect, host)

@@ -48,8 +48,9 @@ class Unseen(Named):
 
     Attributes:
         parameters: Its parameters' names.
-        up_to: Change of the first parameter, from no effect, below which it stays hidden; infinite
-            if all that its bounds allow does, or if the law has a threshold.
+        up_to: Change of a parameter, from no effect, below which it stays hidden: of the first, or
+            of the one that shows most if they act alone. Infinite if all that its bounds allow
+            stays hidden, or if the law has a threshold.
         unit: That parameter's unit.
     """
 

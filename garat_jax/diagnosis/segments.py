@@ -16,8 +16,8 @@ from garat_jax.diagnosis.filters import UNIFORM
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.errors import UserError
 
-WARM_UP = 0.1
-"""Seconds of commands before each segment, at least: they fill delays and activations."""
+WARM_UP = 0.5
+"""Seconds of commands before each segment, at least: they fill delays, lags and activations."""
 LONGEST_GAP = 1.0
 """Seconds that a gap in a recording counts at most, for what is remembered of before it."""
 SHORTEST = 10

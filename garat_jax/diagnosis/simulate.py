@@ -27,7 +27,7 @@ from garat_jax.diagnosis.past import (
 from garat_jax.diagnosis.segments import Grid, Segments, warm_up_steps
 from garat_jax.diagnosis.slots import Slot, columns_of
 from garat_jax.dynamics import Override
-from garat_jax.effects import Effect, in_order
+from garat_jax.effects import Effect, in_order, parameter_at
 from garat_jax.errors import UserError
 
 NUM_PROGRAMS, NUM_FINER = 40, 4
@@ -101,7 +101,7 @@ class Simulator:
         self._warm_up = warm_up_steps(grid, self.host.nu)
         self._grid = grid
         self.slots = tuple(
-            Slot(i, p, float(getattr(effect, p.name)))
+            Slot(i, parameter_at(p, self.host, effect.target), float(getattr(effect, p.name)))
             for i, effect in enumerate(candidates)
             for p in effect.parameters()
         )
@@ -345,9 +345,8 @@ class Simulator:
     def _predict(self, world, chosen: tuple[int, ...], theta, start, ctrl, place, past):
         """Predict one segment step by step: what the sensors report, and the path on the grid.
 
-        During the warm-up the mechanism is held at its start. Where an effect has a memory of the
-        motion it is then led to the start along the measured motion: motors behind gears that
-        bend swing for longer than a segment.
+        During the warm-up it is held at its start. Motors behind gears that bend swing for longer
+        than a segment: with a memory of the motion it is then led along the measured one.
         """
         world = self._with(world, chosen, theta)
         leads = has_memory_of_motion(world.effects, self.host)
@@ -373,7 +372,9 @@ class Simulator:
             state = dynamics.step(world, state, commanded(state, command), self._substeps)
             return state, (whole(dynamics.sensed(world, state)), whole(state))
 
-        state, _ = jax.lax.scan(hold, state, ctrl[: self._warm_up])
+        steps = past.num_steps - num_before + jnp.arange(self._warm_up) if leads else 0
+        warm_up = past.ctrl[past.recording, jnp.maximum(steps, 0)] if leads else ctrl
+        state, _ = jax.lax.scan(hold, state, warm_up[: self._warm_up])
         if leads:
             way = way_to(start, past, self.host, self._grid, self._substeps)
             state, _ = jax.lax.scan(lead, state, way)

@@ -132,7 +132,10 @@ def others(simulator: Simulator, theta: np.ndarray, rows: list[Row], trials: lis
     Parameters that act alone, and had a trial each, have a row already.
     """
     rows, extended = list(rows), []
-    had = {row.column: index for index, row in enumerate(rows)}
+    alone: dict[int, int] = {}
+    for index, row in enumerate(rows):
+        if len(row.values) == 1:
+            alone.setdefault(row.column, index)
     for trial in trials:
         first, effect = trial.rows[0], simulator.effects[trial.effect]
         columns = list(columns_of(simulator.slots, trial.effect).values())
@@ -140,15 +143,15 @@ def others(simulator: Simulator, theta: np.ndarray, rows: list[Row], trials: lis
         for j in columns:
             if j == rows[first].column:
                 continue
-            if trial.is_only and effect.independent and j in had:
-                chosen.append(had[j])
+            if trial.is_only and effect.independent and j in alone:
+                chosen.append(alone[j])
                 continue
             base = trial.start[j] if j in trial.start else float(theta[j])
             step = _step_within(simulator, j, base)
-            alone = effect.independent and len(trial.start) == 1
+            is_alone = effect.independent and len(trial.start) == 1
             chosen.append(len(rows))
-            values = {j: base + step} if alone else {**trial.start, j: base + step}
-            rows.append(Row(j, values, step, -1 if alone else first))
+            values = {j: base + step} if is_alone else {**trial.start, j: base + step}
+            rows.append(Row(j, values, step, -1 if is_alone else first))
         extended.append(trial._replace(rows=tuple(chosen)))
     return rows, extended
 

@@ -38,8 +38,9 @@ def unseen(
     """List the candidates that would change the signals by less than noise hides.
 
     Each is tried at its usual sizes (`Effect.starts`), and with each of its parameters if they act
-    alone; initial states are projected out, as where candidates are scored. The size from which
-    one would show is extrapolated from there, and doubled until it does.
+    alone: the one that shows most counts. Initial states are projected out, as where candidates are
+    scored. The size from which one would show is extrapolated from there, and doubled until it
+    does.
 
     Args:
         problem: The recordings and the model with every candidate.
@@ -63,13 +64,16 @@ def unseen(
     size = size_of(rows)
     shown = {t.effect for t in trials if size[list(t.rows)].max() > SEEN}
     hidden: dict[int, Trial] = {}
-    for t in trials:
+    for t in sorted(trials, key=lambda t: size[t.rows[0]], reverse=True):
         if t.effect not in shown and not _is_shown(simulator.effects[t.effect], seen):
             hidden.setdefault(t.effect, t)
     smooth = {i: t.rows[0] for i, t in hidden.items() if t.is_only and size[t.rows[0]] > 0}
     steps = {i: SEEN / size[first] * rows[first].step for i, first in smooth.items()}
     up_to = _enlarged(problem, {i: rows[first] for i, first in smooth.items()}, steps, size_of)
-    return tuple(_unseen(simulator, index, up_to.get(index, np.inf)) for index in hidden)
+    return tuple(
+        _unseen(simulator, index, rows[hidden[index].rows[0]].column, up_to.get(index, np.inf))
+        for index in sorted(hidden)
+    )
 
 
 def _enlarged(
@@ -103,9 +107,8 @@ def _is_shown(effect: Effect, seen: Collection[Named]) -> bool:
     return any(Named(kind, effect.target) in seen for kind in (effect.kind, *effect.refines))
 
 
-def _unseen(simulator: Simulator, index: int, up_to: float) -> Unseen:
+def _unseen(simulator: Simulator, index: int, column: int, up_to: float) -> Unseen:
     effect = simulator.effects[index]
-    first, *_ = effect.parameters()
-    unit = unit_at(first, simulator.host, effect.target)
+    unit = unit_at(simulator.slots[column].parameter, simulator.host, effect.target)
     names = tuple(p.name for p in effect.parameters())
     return Unseen(effect.kind, effect.target, names, float(up_to), unit)

@@ -11,6 +11,20 @@ from garat_jax.effects.elements import element_id
 AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+NOTICED = 0.1
+"""Acceleration [rad/s², m/s²] that a recording shows."""
+
+
+def small_torque(host: mujoco.MjModel, name: str, least: float) -> float:
+    """Return a torque [N m] or force [N] that is small at a joint, but shows there.
+
+    Args:
+        host: The compiled model.
+        name: The joint.
+        least: As much as that, at least.
+    """
+    dof = int(host.joint(name).dofadr[0])
+    return max(least, NOTICED / float(host.dof_invweight0[dof]))
 
 
 def at_dof(host: mujoco.MjModel, joint: int, torque: jax.Array, dtype) -> jax.Array:

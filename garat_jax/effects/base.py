@@ -122,7 +122,7 @@ class Effect(abc.ABC):
     notes: ClassVar[bool] = False
     """Whether `note` does anything: what is reported depends on states of some time ago."""
     remembers: ClassVar[bool] = False
-    """Whether `apply`'s memory reaches back further than 0.1 s: then it is followed along all the
+    """Whether `apply`'s memory reaches back further than 0.5 s: then it is followed along all the
     recorded commands before a segment. It may not read the state."""
     refines: ClassVar[tuple[str, ...]] = ()
     """Kinds that are this law with parameters left out; they come first where they do as well."""

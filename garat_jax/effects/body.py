@@ -18,6 +18,11 @@ SMALLEST_MASS = 1e-9
 """Mass [kg] and inertia [kg m²] of the payload's body when the model is compiled."""
 PAYLOADS = (0.1, 0.5)
 """Payloads that are tried, relative to the mass that the body carries, its own included."""
+BALANCED = 0.2
+"""Distance of a centre of mass from a hinge's axis, relative to the body's radius of gyration,
+below which a payload is tried beside it, too."""
+ACROSS = 0.5
+"""Cosine of the angle between a hinge and an axis of its body from which that axis is along it."""
 
 
 @struct.dataclass
@@ -83,11 +88,20 @@ class PayloadMass(Effect):
 
     @classmethod
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
-        """Try a light and a heavy payload: the response to a heavy one is no multiple."""
-        carried = float(host.body_subtreemass[host.body(target.partition("/")[2]).id])
-        mass = cls.parameters()[0]
-        sizes = (share * max(carried, SMALLEST_MASS) for share in PAYLOADS)
-        return tuple({mass.name: min(size, mass.high)} for size in sizes)
+        """Try a light and a heavy payload: the response to a heavy one is no multiple.
+
+        Of a body that turns about its centre of mass a payload there would not show.
+        """
+        body = host.body(target.partition("/")[2])
+        mass, *axes = cls.parameters()
+        carried = max(float(host.body_subtreemass[body.id]), SMALLEST_MASS)
+        light, heavy = (min(share * carried, mass.high) for share in PAYLOADS)
+        beside = [
+            {mass.name: light, p.name: float(np.clip(body.ipos[i] + way, p.low, p.high))}
+            for i, p in enumerate(axes)
+            for way in _ways_off_axis(host, body.id, i)
+        ]
+        return ({mass.name: light}, {mass.name: heavy}, *beside)
 
     def unlock(self, spec: mujoco.MjSpec) -> None:
         """Keep the compiler from taking the centre of mass for the body's origin."""
@@ -122,6 +136,22 @@ class PayloadMass(Effect):
             mass=mass,
             inertia=[SMALLEST_MASS] * 3,
         )
+
+
+def _ways_off_axis(host: mujoco.MjModel, body: int, axis: int) -> tuple[float, ...]:
+    """Return both ways [m] along an axis of a body from its centre of mass, off its hinge's axis.
+
+    As far as the radius of gyration; none if the centre of mass is not on the hinge's axis, or the
+    way is along it.
+    """
+    joint, mass = int(host.body_jntadr[body]), float(host.body_mass[body])
+    if joint < 0 or host.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE or not mass:
+        return ()
+    reach = float(np.sqrt(host.body_inertia[body].max() / mass))
+    hinge = host.jnt_axis[joint]
+    lever = np.linalg.norm(np.cross(hinge, host.body_ipos[body] - host.jnt_pos[joint]))
+    is_balanced, is_across = lever < BALANCED * reach, abs(hinge[axis]) < ACROSS
+    return (reach, -reach) if is_balanced and is_across else ()
 
 
 @struct.dataclass

@@ -15,7 +15,13 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 
-from garat_jax.effects.at_joint import actuator_torque, at_dof, felt_inertia, is_driven
+from garat_jax.effects.at_joint import (
+    actuator_torque,
+    at_dof,
+    felt_inertia,
+    is_driven,
+    small_torque,
+)
 from garat_jax.effects.base import Effect, ModelView, parameter
 from garat_jax.effects.elements import element_id
 
@@ -289,8 +295,7 @@ class StribeckFriction(VaryingFriction):
     @classmethod
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
         """Try a peak at several speeds: it is felt only below them."""
-        del host, target
-        size = cls.parameters()[0].scale
+        size = small_torque(host, target.partition("/")[2], cls.parameters()[0].scale)
         return tuple(
             {"coulomb": size, "static": 2.0 * size, "velocity": speed} for speed in (0.02, 0.1, 0.5)
         )
@@ -323,10 +328,10 @@ class LoadFriction(VaryingFriction):
 
     |τ| ≤ μ·|τ_a|, against the motion, with τ_a the actuators' torque at the joint as the model has
     it. A gear gives (1 − μ) of the torque when it drives and (1 + μ) when it is driven back.
-    Commands are seen as the effects listed before this one leave them. Shows as friction that grows
-    with load, at every speed. Typical: 1 minus a gear's efficiency: 0.02 for spur gears, 0.1 to 0.3
-    for harmonic drives, above 0.5 for worm gears; Duclusaud et al. 2024 (arXiv 2410.08650) have the
-    law among their friction models of servos.
+    Commands are seen as they reach the motor. Shows as friction that grows with load, at every
+    speed. Typical: 1 minus a gear's efficiency: 0.02 for spur gears, 0.1 to 0.3 for harmonic
+    drives, above 0.5 for worm gears; Duclusaud et al. 2024 (arXiv 2410.08650) have the law among
+    their friction models of servos.
     """
 
     kind: ClassVar[str] = "load_friction"

@@ -12,7 +12,7 @@ from flax import struct
 from scipy import optimize, signal
 
 from garat_jax.effects.actuator import can_bias, is_limited, make_affine
-from garat_jax.effects.at_joint import at_dof
+from garat_jax.effects.at_joint import at_dof, small_torque
 from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
 from garat_jax.effects.elements import element_id
 from garat_jax.effects.most import follow_most, median_distance
@@ -237,8 +237,7 @@ class CoggingTorque(Effect):
     @classmethod
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:
         """Try common numbers of periods, in phase and a quarter of a period late."""
-        del host, target
-        size = cls.parameters()[0].scale
+        size = small_torque(host, target.partition("/")[2], cls.parameters()[0].scale)
         return tuple(
             {"amplitude": size, "periods": float(periods), "phase": phase}
             for periods in (1, 2, 4, 6, 12, 24)
