@@ -21,6 +21,8 @@ OPTION_WORDS = {
 
 LED = ("friction", "damping", "stiffness", "gear", "gainprm", "dynprm", "size")
 """Fields of several numbers of which the first says most: one number alone is that."""
+SPRUNG = ("damping", "stiffness")
+"""Fields of a joint that its `springdamper`, if it has one, decides."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +62,10 @@ class Override:
         try:
             if not _is_finite(value):
                 raise ValueError("not finite")
+            if self.element == "joint" and self.field in SPRUNG and np.any(target.springdamper):
+                raise UserError(
+                    f"joint/{self.name} {self.field} follows from its springdamper; override that"
+                )
             if self.element == "body" and self.field == "mass":
                 _scale_mass(spec, target, float(value))
             elif np.ndim(current) == 1 and np.ndim(value) == 0:

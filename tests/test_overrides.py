@@ -70,3 +70,13 @@ def test_a_wrong_override_is_refused_in_one_line(override, message):
     with pytest.raises(UserError, match=message) as error:
         compiled(override)
     assert "\n" not in str(error.value)
+
+
+def test_what_a_springdamper_decides_is_not_overridden():
+    sprung = PENDULUM.replace('name="hinge"', 'name="hinge" springdamper="0.5 1"')
+    for field in ("damping", "stiffness"):
+        with pytest.raises(UserError, match=f"joint/hinge {field} follows from its springdamper"):
+            Override("joint", "hinge", field, 3.0).apply(spec(sprung))
+    other = spec(sprung)
+    Override("joint", "hinge", "springdamper", (1.0, 1.0)).apply(other)
+    assert other.compile().jnt_stiffness[0] < spec(sprung).compile().jnt_stiffness[0]

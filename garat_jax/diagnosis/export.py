@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
+import numpy as np
 
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.effects import Effect, in_order
@@ -46,6 +47,7 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
     spec = model.spec.copy()
     for override in model.overrides:
         override.apply(spec)
+    _write_out_springs(spec)
     unsaid = tuple(
         line if effect.kind in line else f"{effect.kind} at {effect.target}: {line}"
         for effect in sorted(in_order(model.effects), key=_turn)
@@ -67,6 +69,16 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
             f"{path}: MuJoCo cannot read the model back: {' '.join(str(error).split())}"
         ) from error
     return Exported(path, unsaid)
+
+
+def _write_out_springs(spec: mujoco.MjSpec) -> None:
+    """Write stiffness and damping in place of a springdamper, which would overwrite both."""
+    host = spec.copy().compile()
+    for joint in spec.joints:
+        if joint.name and np.any(joint.springdamper):
+            compiled = host.joint(joint.name)
+            joint.stiffness[0], joint.damping[0] = compiled.stiffness[0], compiled.damping[0]
+            joint.springdamper = [0.0, 0.0]
 
 
 def _turn(effect: Effect) -> int:

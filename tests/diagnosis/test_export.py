@@ -12,7 +12,7 @@ from garat_jax.diagnosis import load_model
 from garat_jax.diagnosis.export import copy_model, export_mjcf
 from garat_jax.diagnosis.model_card import save_card
 from garat_jax.dynamics import Override
-from garat_jax.effects import CATALOGUE
+from garat_jax.effects import CATALOGUE, JointStiffness, ViscousDamping
 from garat_jax.errors import UserError
 from tests import models
 
@@ -262,3 +262,23 @@ def test_an_override_that_mjcf_does_not_know_is_refused(tmp_path):
             type(model)(model.name, model.path, model.mjcf, model.spec, (bad,)),
             tmp_path / "x.xml",
         )
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        ViscousDamping("joint/hinge", coefficient=0.2),
+        JointStiffness("joint/hinge", stiffness=2.0, reference=0.3),
+    ],
+    ids=["damping", "stiffness"],
+)
+def test_what_is_added_to_a_springdamper_stays(tmp_path, effect):
+    mjcf = tmp_path / "sprung.xml"
+    mjcf.write_text(models.PENDULUM.replace('name="hinge"', 'name="hinge" springdamper="0.5 1"'))
+    model = load_model(mjcf)
+    card = load_model(save_card(tmp_path / "with.toml", model, [effect]))
+    exported = export_mjcf(card, tmp_path / "with.xml")
+    assert not exported.unsaid
+    expected = simulate_card(card)
+    assert np.abs(expected - simulate_card(model)).max() > 1e-3
+    np.testing.assert_allclose(simulate_plain(exported.path), expected, atol=3e-4)

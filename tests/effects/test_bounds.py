@@ -85,3 +85,16 @@ def test_a_heavy_axis_may_have_more_damping_than_a_hinge():
     dynamics.compile(axis, effects=(ViscousDamping("joint/along", coefficient=250.0),))
     with pytest.raises(UserError, match="0 to 10000 N s/m"):
         dynamics.compile(axis, effects=(ViscousDamping("joint/along", coefficient=2e4),))
+
+
+def test_a_payload_may_be_at_the_end_of_a_long_body():
+    boom = models.spec(
+        models.PENDULUM.replace('fromto="0 0 0 0 0 -0.5"', 'fromto="0 0 0 0 0 -4"')
+    ).compile()
+    short = models.spec(models.PENDULUM).compile()
+    place = next(p for p in CATALOGUE["payload_mass"].parameters() if p.name == "z")
+    there = parameter_at(place, boom, "body/pole")
+    assert there.low == -there.high < -4.0
+    assert parameter_at(place, short, "body/pole") == place
+    mass = CATALOGUE["payload_mass"].parameters()[0]
+    assert parameter_at(mass, boom, "body/pole") == mass
