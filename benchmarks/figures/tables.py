@@ -332,7 +332,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "optimisation_level": optimisation_level,
     "profiling_clock": profiling_clock,
     "hidden_effects": functools.partial(hidden_effects, 9),
-    "hidden_effects_before": functools.partial(hidden_effects_before, (10, 8, 7, 6, 5, 4)),
+    "hidden_effects_before": functools.partial(hidden_effects_before, (11, 10, 8, 7, 6, 5, 4)),
     "timing": timing,
     "real_data": real_data,
     "ground": ground,
