@@ -9,7 +9,7 @@ from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.findings import Named
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.segments import choose_grid, cut
+from garat_jax.diagnosis.segments import WARM_UP, choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.errors import UserError
 from tests.diagnosis.pendulum import MODEL, add_damping, record
@@ -69,12 +69,12 @@ def test_after_a_gap_the_last_command_before_it_was_held(jitter):
     grid = choose_grid([made], 0.005)
     assert grid.uniform == (jitter == 0.0)
     segments = cut([made], grid, 0.2)
-    warm_up = round(0.1 / grid.interval)
+    warm_up = round(WARM_UP / grid.interval)
     before = segments.ctrl[segments.first == 100, :warm_up, 0]
     assert before.tolist() == [[99.0] * warm_up]
-    begin = segments.ctrl[segments.first == 120, :warm_up, 0][0]
+    begin = segments.ctrl[segments.first == 160, :warm_up, 0][0]
     assert begin[0] in (109.0, 110.0)
-    assert begin[-1] == 119.0
+    assert begin[-1] == 159.0
 
 
 def test_a_recording_in_another_unit_of_time_is_named():
