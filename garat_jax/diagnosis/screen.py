@@ -192,12 +192,14 @@ def _score(
     wanted = abs(matrix[:, 0] @ residual) / max(norm[0] ** 2, 1e-300)  # times what is tried
     times = np.where(is_tried, np.where(switched, max(wanted, 1.0), 1.0), np.maximum(times, 1.0))
     seen = (norm * times > VISIBLE) & (norm > 1e-3 * norm.max(initial=0.0))
-    given = [k for k, i in enumerate(chosen) if rows[i].column in trial.start and seen[k]]
-    if not seen[0]:
+    given = [k for k, i in enumerate(chosen) if rows[i].column in trial.start]
+    refines = bool(problem.simulator.effects[trial.effect].refines)  # else it is the simpler law
+    if unseen := [slots[k].name for k in (0, *(given if refines else ())) if not seen[k]]:
         tried = "" if trial.is_only else "at the sizes tried, "
-        reason = f"the recordings do not excite it: {tried}no signal depends on its {slots[0].name}"
+        reason = f"the recordings do not excite it: {tried}no signal depends on its {unseen[0]}"
         columns = tuple(rows[i].column for i in chosen)
         return Score(trial.effect, columns, (), {}, 0.0, 1.0, False, matrix[:, 0], reason)
+    given = [k for k in given if seen[k]]
     residual, weighted = weight * residual, weight[:, None] * matrix
     needed = _needed(weighted, residual, seen, given)
     chosen, matrix, weighted = [chosen[i] for i in needed], matrix[:, needed], weighted[:, needed]
