@@ -95,7 +95,10 @@ def join_processes(
             f"the processes do not come together: {error}; give --coordinator HOST:PORT, "
             "--num-processes N and --process-id K"
         ) from error
-    use(device)
+    if use(device)[0].platform == "cpu":
+        # Of one kept program the collectives run in another order than of the same one compiled
+        # anew (jaxlib 0.10.2), and only process 0 keeps them: each would wait for the other.
+        jax.config.update("jax_enable_compilation_cache", False)
     return jax.process_index()
 
 

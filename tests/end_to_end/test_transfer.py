@@ -192,12 +192,23 @@ def start_command(*arguments: str, program: str = GARAT, **environment: str):
     )
 
 
-def test_the_command_in_two_processes_finds_what_one_process_finds(tmp_path, finished):
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.mark.parametrize("which", ["first", "second"])
+def test_the_command_in_two_processes_finds_what_one_process_finds(
+    tmp_path, finished, cache, which
+):
+    del which  # start; the programs that the first may have kept are there for the second
     out = tmp_path / "run"
     arguments = ["transfer", NAME, "--seeds", "2", "--out", str(out), "--distributed"]
     arguments += ["--coordinator", f"localhost:{free_port()}", "--num-processes", "2"]
+    kept = {"JAX_COMPILATION_CACHE_DIR": str(cache)}
     processes = [
-        start_command(*arguments, "--process-id", str(number), program=TINY) for number in range(2)
+        start_command(*arguments, "--process-id", str(number), program=TINY, **kept)
+        for number in range(2)
     ]
     try:
         for process in processes:
