@@ -32,7 +32,7 @@ from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import SHORTEST, grid_for
 from garat_jax.diagnosis.separate import next_experiment
-from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.simulate import Simulator, simulator_of
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.suggest import suggest
 from garat_jax.diagnosis.unseen import is_still, unseen
@@ -75,7 +75,7 @@ def diagnose(
     plain = Simulator(whole, (), grid)
     horizon, segments = choose_horizon(plain, everything, grid, num_fitted=len(fitted))
     say(say_horizon(everything, horizon))
-    simulator = Simulator(model, (*shared, *others), grid, acting=range(len(shared)))
+    simulator = simulator_of(model, (*shared, *others), grid, tuple(range(len(shared))))
     warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
     warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, everything, grid, horizon)

@@ -23,7 +23,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.segments import grid_for
-from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.simulate import Simulator, simulator_of
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.dynamics import native_model
@@ -45,12 +45,14 @@ def nominal_effects(model: Model, selected: Sequence[Candidate]) -> tuple[Effect
 
 
 def found_theta(simulator: Simulator, selected: Sequence[Candidate]) -> np.ndarray:
-    """Return the parameters that a diagnosis found, [num_parameters]; more effects have no size."""
+    """Return the parameters that a diagnosis found, [num_parameters]; others have no size."""
+    found = {c.named: c for c in selected}
     theta = simulator.base.copy()
     for j, slot in enumerate(simulator.slots):
-        estimates = selected[slot.effect].parameters if slot.effect < len(selected) else {}
-        if slot.parameter.name in estimates:
-            theta[j] = estimates[slot.parameter.name].estimate
+        effect = simulator.effects[slot.effect]
+        candidate = found.get(Named(effect.kind, effect.target))
+        if candidate and slot.parameter.name in candidate.parameters:
+            theta[j] = candidate.parameters[slot.parameter.name].estimate
     return theta
 
 
@@ -115,17 +117,20 @@ def _alone(
     everything = thin((*parts[0], *parts[1]))
     host = native_model(model.compile(engine="mujoco"))
     grid = grid_for(everything, host)
-    effects = (*nominal_effects(model, selected), *_rivals(model, selected, candidates))
-    simulator = Simulator(model, effects, grid)
+    simulator = simulator_of(model, make_candidates(model), grid, ())
     theta = found_theta(simulator, selected)
+    place = {Named(e.kind, e.target): i for i, e in enumerate(simulator.effects)}
+    acting = {place[c.named]: c for c in selected}
+    rivals = {place[named] for named in _rivals(selected, candidates) if named in place}
+    skip = [i for i in place.values() if i not in rivals]
     _, segments = choose_horizon(simulator, everything, grid)
     everywhere = np.ones(len(segments.start), bool)
     whole = Problem(simulator, segments, everywhere, grid.sample)
     free = {
-        j: _Parameter(selected[slot.effect].named, slot.parameter.name, estimate.unit)
+        j: _Parameter(acting[slot.effect].named, slot.parameter.name, estimate.unit)
         for j, slot in enumerate(simulator.slots)
-        if slot.effect < len(selected)
-        and (estimate := selected[slot.effect].parameters.get(slot.parameter.name))
+        if slot.effect in acting
+        and (estimate := acting[slot.effect].parameters.get(slot.parameter.name))
         and np.isfinite(estimate.high - estimate.low)
     }
     longer = cut_longer(whole, everything, grid, theta)
@@ -136,7 +141,7 @@ def _alone(
         own = whole.segments.recording == index
         alone = whole.take(own)
         found = fit(alone, theta, settled.start[own], free)
-        needs = [_need(alone, found, number, len(selected)) for number in range(len(selected))]
+        needs = {number: _need(alone, found, number, skip) for number in acting}
         fitted = count_timestep(alone, found)
         for place, (j, parameter) in enumerate(free.items()):
             seen = j not in fitted.frozen
@@ -149,23 +154,22 @@ def _alone(
     return sightings
 
 
-def _rivals(model: Model, selected, candidates) -> list[Effect]:
-    """Return the best candidates that these recordings can tell from all selected, of no size."""
+def _rivals(selected: Sequence[Candidate], candidates: Sequence[Candidate]) -> list[Named]:
+    """Return the best candidates that these recordings can tell from all selected."""
     taken = {c.named for c in selected}
     taken |= {named for c in selected for named in c.indistinguishable_from}
     best = dict.fromkeys(c.named for c in candidates if c.named not in taken)
-    places = list(best)[:NUM_RIVALS]
-    offered = {Named(e.kind, e.target): e for e in make_candidates(model)}
-    return [offered[place] for place in places if place in offered]
+    return list(best)[:NUM_RIVALS]
 
 
 def _need(
-    alone: Problem[Simulator], fitted: Fit, effect: int, num_selected: int
+    alone: Problem[Simulator], fitted: Fit, effect: int, skip: Sequence[int]
 ) -> tuple[float, float, tuple[Named, ...]]:
     """Return the errors without and with an effect, and which rivals explain more.
 
-    A rival explains what its sensitivity promises, as in the scoring of candidates; it is ahead if
-    that leaves clearly less of the squared residual than the effect does.
+    A rival, which is what is not skipped, explains what its sensitivity promises, as in the scoring
+    of candidates; it is ahead if that leaves clearly less of the squared residual than the effect
+    does.
     """
     simulator = alone.simulator
     owners = np.asarray([slot.effect for slot in simulator.slots])
@@ -175,7 +179,7 @@ def _need(
     left = fitted.cost.sum() / without.cost.sum()
     ahead = tuple(
         Named(rival.kind, rival.target)
-        for score in screen(alone, without, range(num_selected))
+        for score in screen(alone, without, skip)
         if score.possible and not score.excluded and (1.0 - score.share) * TOO_CLOSE < left
         for rival in [simulator.effects[score.effect]]
     )

@@ -6,8 +6,7 @@ moves their leaves; at its nominal value an effect is the identity, so that prog
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +15,7 @@ import numpy as np
 from garat_jax import dynamics
 from garat_jax.compiler_options import options_of_replay
 from garat_jax.diagnosis.activation import Follower
+from garat_jax.diagnosis.batches import Batches, Program, compile_together
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.past import (
     Past,
@@ -33,28 +33,9 @@ from garat_jax.errors import UserError
 NUM_PROGRAMS, NUM_FINER = 40, 4
 """How many programs stay compiled: on a CPU one takes some 250 of a process's 65,530 memory maps,
 and a diagnosis has two simulators, of up to two batch sizes a program, and five finer ones."""
-BATCH_SIZES = (256, 1024)
-"""Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
-substep, many simulations share its cost. Each size is compiled once."""
-
 FEW = 4
 """Candidates up to which a program is optimised. In those that fit them, which run often, few act;
 in those of screening, which run a few times, as many as a model has places for them."""
-
-
-class Program(NamedTuple):
-    """A compiled program.
-
-    Attributes:
-        run: Takes a batch of (theta, start, ctrl, place), the `Past` if it looks back, else None,
-            and a path if it looks along one.
-        looks_back: Whether an effect remembers, or has a memory of the motion.
-        is_stepped: Whether C MuJoCo is called for every physics substep.
-    """
-
-    run: Callable
-    looks_back: bool
-    is_stepped: bool
 
 
 class Simulator:
@@ -158,7 +139,7 @@ class Simulator:
         for rows in (np.flatnonzero(at_once), np.flatnonzero(~at_once)):
             if len(rows):
                 run = self._program(self._acting(theta[rows]))
-                result[rows] = self._in_batches(run, segments, theta[rows], start[rows])[0]
+                result[rows] = self._batches(run, segments, theta[rows], start[rows]).run()[0]
         is_told = (segments.weight[..., None] > 0) | np.isfinite(result)
         return np.where(is_told, result, segments.measured)
 
@@ -184,7 +165,8 @@ class Simulator:
         """
         result = np.empty((len(theta), *segments.measured.shape))
         program = self._program(self._acting(base[None]))
-        alone, path = self._in_batches(program, segments, base[None], start[None])
+        alone, path = self._batches(program, segments, base[None], start[None]).run()
+        calls = []
         for (way, _), rows in self._ways(theta, base).items():
             both = np.concatenate([base[None], theta[rows]])
             starts = np.broadcast_to(start, (len(both), *start.shape))
@@ -193,7 +175,10 @@ class Simulator:
                 run, along = self._jitted("along", chosen), path[0]
             else:
                 run, along = self._program(chosen), None
-            changed = self._in_batches(run, segments, both, starts, along)[0]
+            calls.append((rows, chosen, self._batches(run, segments, both, starts, along)))
+        compile_together([batches for *_, batches in calls])
+        for rows, chosen, batches in calls:
+            changed = batches.run()[0]
             if _any_stays_finite(alone[0]) and not _any_stays_finite(changed[0]):
                 raise self._unstable(chosen, base, start, segments)
             result[rows] = changed[1:] - changed[0]
@@ -203,7 +188,8 @@ class Simulator:
         """Name, of some effects, the one with which no simulation stays finite at its nominal."""
 
         def stays_finite(i: int) -> bool:
-            signals, _ = self._in_batches(self._program((i,)), segments, base[None], start[None])
+            program = self._program((i,))
+            signals, _ = self._batches(program, segments, base[None], start[None]).run()
             return _any_stays_finite(signals[0])
 
         effect = self.effects[next((i for i in chosen if not stays_finite(i)), chosen[0])]
@@ -261,37 +247,10 @@ class Simulator:
         run = jax.jit(jax.vmap(one, axes), compiler_options=options)
         return Program(run, looks_back, way == "stepped")
 
-    def _in_batches(self, program: Program, segments: Segments, theta, start, path=None):
-        """Run a program for rows [P] and segments [S]; return signals and paths [P, S, ..].
-
-        Parameters are a row's, or each segment's own. Rows and segments together are cut into
-        batches of a size that is compiled once.
-        """
-        num_rows, num_segments = start.shape[:2]
-        total = num_rows * num_segments
-        size = BATCH_SIZES[program.is_stepped and total > 2 * BATCH_SIZES[0]]
-        starts = start.reshape(total, -1)
+    def _batches(self, program: Program, segments: Segments, theta, start, path=None) -> Batches:
+        """Lay out the batches of a program; see `Batches`."""
         activations = self._follower(segments.begins, segments.past)
-        found, paths = [], []
-        for first in range(0, total, size):
-            chosen = np.minimum(np.arange(first, first + size), total - 1)
-            row, segment = chosen // num_segments, chosen % num_segments
-            more = () if path is None else (path[segment],)
-            begin = starts[chosen]
-            begin[total - first :] = np.nan  # padding: C MuJoCo leaves it out
-            own = theta[row, segment] if theta.ndim > 2 else theta[row]
-            before = (segments.recording[segment], segments.num_past[segment])
-            past = Past(segments.past, segments.past_qvel, activations, *before)
-            inputs = (own, begin, segments.ctrl[segment], segments.place[segment])
-            inputs = (*inputs, past if program.looks_back else None)
-            with jax.enable_x64(True):
-                signals, true = program.run(*inputs, *more)
-                found.append(np.asarray(signals)[..., : segments.measured.shape[2]])
-                paths.append(np.asarray(true))
-        return tuple(
-            np.concatenate(parts)[:total].reshape(num_rows, num_segments, *parts[0].shape[1:])
-            for parts in (found, paths)
-        )
+        return Batches(program, segments, activations, theta, start, path)
 
     def with_parameters(self, theta, chosen: Sequence[int]) -> tuple[Effect, ...]:
         """Return some of the candidates with the values of `theta`, [num_parameters]."""
@@ -392,6 +351,14 @@ class Simulator:
         below = jnp.minimum(place.astype(int), len(path) - 2)
         fraction = (place - below)[:, None]
         return (1 - fraction) * path[below] + fraction * path[below + 1]
+
+
+@functools.lru_cache(maxsize=1)
+def simulator_of(
+    model: Model, candidates: tuple[Effect, ...], grid: Grid, acting: tuple[int, ...]
+) -> Simulator:
+    """Return a `Simulator`; the last is kept, with its programs, for another look at the same."""
+    return Simulator(model, candidates, grid, acting=acting)
 
 
 def _any_stays_finite(signals: np.ndarray) -> bool:
