@@ -34,8 +34,10 @@ NUM_PROGRAMS, NUM_FINER = 40, 4
 """How many programs stay compiled: on a CPU one takes some 250 of a process's 65,530 memory maps,
 and a diagnosis has two simulators, of up to two batch sizes a program, and five finer ones."""
 FEW = 4
-"""Candidates up to which a program is optimised. In those that fit them, which run often, few act;
-in those of screening, which run a few times, as many as a model has places for them."""
+"""Candidates up to which a program with calls a substep is optimised. In those that fit them, which
+run often, few act; in those of screening, which run a few times, as many as a model has places for
+them. One of whole segments is optimised always: memories of commands would take most of its time.
+"""
 
 
 class Simulator:
@@ -94,6 +96,8 @@ class Simulator:
         looking = [i for i, e in enumerate(replayed) if e.reads_state or e.notes]
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
         self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
+        self._plain = tuple(i for i in self._blind if self._is_memoryless(replayed[i]))
+        self._recalling = tuple(i for i in self._blind if i not in self._plain)
         self._transform = model.transform
         self._follower = Follower(self.host, grid.interval)
         self._any_at_once = dynamics.steps_at_once(self._alone) and model.transform is None
@@ -167,10 +171,13 @@ class Simulator:
         program = self._program(self._acting(base[None]))
         alone, path = self._batches(program, segments, base[None], start[None]).run()
         calls = []
-        for (way, _), rows in self._ways(theta, base).items():
+        for (way, moving), rows in self._ways(theta, base).items():
             both = np.concatenate([base[None], theta[rows]])
             starts = np.broadcast_to(start, (len(both), *start.shape))
-            chosen = self._blind if way == "at once" else self._acting(both)
+            chosen = self._acting(both)
+            if way == "at once":  # all that move so share a program
+                alike = self._recalling if moving else self._plain
+                chosen = tuple(sorted({*alike, *chosen}))
             if way == "along":
                 run, along = self._jitted("along", chosen), path[0]
             else:
@@ -205,7 +212,7 @@ class Simulator:
             kinds = " ".join(sorted({self.effects[j].kind for j in moved - blind}))
             acting = {*self._acting(np.stack([base, row]))}
             if self._any_at_once and acting <= blind:
-                way = ("at once", "")
+                way = ("at once", "" if moved <= {*self._plain} else "memories of commands")
             elif self._any_at_once and moved <= memoryless and acting <= memoryless:
                 way = ("along", kinds)
             else:
@@ -243,7 +250,8 @@ class Simulator:
         one = functools.partial(predict, world, chosen)
         past = Past._make((None, None, None, 0, 0)) if looks_back else None
         axes = (0, 0, 0, 0, past, 0)[: 6 if way == "along" else 5]
-        options = options_of_replay(self._alone.engine, runs_often=len(chosen) <= FEW)
+        runs_often = way == "at once" or len(chosen) <= FEW
+        options = options_of_replay(self._alone.engine, runs_often)
         run = jax.jit(jax.vmap(one, axes), compiler_options=options)
         return Program(run, looks_back, way == "stepped")
 

@@ -16,6 +16,8 @@ from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import Override, native_model
 from garat_jax.effects import (
+    ActuatorDelay,
+    ActuatorLag,
     Effect,
     MotorGain,
     StribeckFriction,
@@ -121,9 +123,35 @@ def test_beyond_the_end_of_a_recording_a_model_may_diverge():
 
 
 def test_an_effect_that_breaks_the_model_at_its_nominal_is_named():
-    effects = (MotorGain("actuator/shoulder"), Broken("actuator/elbow"))
+    effects = (ActuatorLag("actuator/shoulder"), Broken("actuator/elbow"))
     simulator, segments = make_simulator(models.ARM, effects)
     theta = simulator.base.copy()
-    theta[0] = 0.9
+    theta[0] = 0.01
     with pytest.raises(UserError, match="no simulation with broken at actuator/elbow stays finite"):
         simulator.linear_change(theta[None], simulator.base, segments.start, segments)
+
+
+def test_effects_that_remember_commands_have_a_program_of_their_own():
+    effects = (
+        MotorGain("actuator/shoulder"),
+        ViscousDamping("joint/elbow"),
+        ActuatorLag("actuator/shoulder"),
+        ActuatorDelay("actuator/elbow"),
+    )
+    simulator, segments = make_simulator(models.ARM, effects)
+    columns = [next(j for j, s in enumerate(simulator.slots) if s.effect == i) for i in range(4)]
+    thetas = np.tile(simulator.base, (4, 1))
+    thetas[np.arange(4), columns] += 0.02
+    assert [*simulator._ways(thetas, simulator.base).values()] == [[0, 1], [2, 3]]
+    together = simulator.linear_change(thetas, simulator.base, segments.start, segments)
+    for theta, changed in zip(thetas, together, strict=True):
+        alone = simulator.linear_change(theta[None], simulator.base, segments.start, segments)[0]
+        assert np.abs(changed).max() > 1e-4
+        assert np.abs(changed - alone).max() < 1e-9
+    late = thetas[3]  # what acts already, acts in the program of the others, too
+    beside = late + (thetas[0] - simulator.base)
+    change = simulator.linear_change(beside[None], late, segments.start, segments)[0]
+    both = np.stack([late, beside])
+    starts = np.stack([segments.start] * 2)
+    before, after = simulator.predict(both, starts, segments)
+    np.testing.assert_allclose(change, after - before, atol=1e-9)
