@@ -49,7 +49,6 @@ peers: setup
 
 demo: setup
 	$(BIN)/garat demo --out $(OUT) --force $(if $(MEASUREMENTS),--measurements $(MEASUREMENTS))
-	@echo "report: $(OUT)/report.html"
 
 test: setup
 	@$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile

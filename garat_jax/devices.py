@@ -91,11 +91,12 @@ def join_processes(
     try:
         jax.distributed.initialize(coordinator, count, number)
     except (RuntimeError, ValueError) as error:
+        reason = str(error).rstrip(".")
         raise UserError(
-            f"the processes do not come together: {error}; give --coordinator HOST:PORT, "
+            f"the processes do not come together: {reason}; give --coordinator HOST:PORT, "
             "--num-processes N and --process-id K"
         ) from error
-    if use(device)[0].platform == "cpu":
+    if use(device)[0].platform == "cpu" and jax.process_count() > 1:
         # Of one kept program the collectives run in another order than of the same one compiled
         # anew (jaxlib 0.10.2), and only process 0 keeps them: each would wait for the other.
         jax.config.update("jax_enable_compilation_cache", False)

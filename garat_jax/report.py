@@ -83,7 +83,8 @@ class Reproduce:
         processor = machine["cpu"] or "unknown processor"
         lines.append(f"Machine: {processor}, {machine['cores']} cores, {machine['system']}.")
         if config["seeds"]:
-            lines.append("Seeds: " + ", ".join(map(str, config["seeds"])) + ".")
+            seeds = config["seeds"]
+            lines.append(f"Seed{'s' * (len(seeds) > 1)}: {', '.join(map(str, seeds))}.")
         if git:
             changed = ", with changes that are not committed" if git["dirty"] else ""
             lines.append(f"Commit: {git['commit']}{changed}.")

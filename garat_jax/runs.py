@@ -35,10 +35,12 @@ class RunDirectory:
     Attributes:
         root: The folder.
         resumed: Whether the folder held this run before it was opened.
+        made: The folders that were made for it to lie in, innermost first.
     """
 
     root: Path
     resumed: bool = False
+    made: tuple[Path, ...] = dataclasses.field(default=(), repr=False)
 
     @classmethod
     def create(
@@ -87,11 +89,12 @@ class RunDirectory:
                     f"{root} exists already: give --force to replace it, {go_on}or another --out"
                 )
             shutil.rmtree(root)
+        missing = tuple(folder for folder in root.parents if not folder.exists())
         try:
             root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f"cannot make the folder {root}: {error.strerror}") from error
-        run = cls(root)
+        run = cls(root, made=missing)
         run.write_json(CONFIG, {"format": FORMAT, "command": line, **record, **provenance()})
         return run
 
@@ -134,9 +137,15 @@ class RunDirectory:
         ]
 
     def discard(self) -> None:
-        """Remove the folder if nothing came of the run: `config.json` is all that it holds."""
+        """Remove the folder if nothing came of the run: `config.json` is all that it holds.
+
+        What was made for it to lie in goes with it, if nothing else lies there by now.
+        """
         if not self.resumed and not _holds_results(self.root):
             shutil.rmtree(self.root)
+            with contextlib.suppress(OSError):
+                for folder in self.made:
+                    folder.rmdir()
 
     def path(self, name: str) -> Path:
         """Return the path of a file in the run, and make the folder that it belongs to."""

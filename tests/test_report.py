@@ -95,4 +95,4 @@ def test_reproduce_names_command_versions_and_seeds(tmp_path):
     assert found.command == "garat demo"
     text = " ".join(found.lines)
     assert "jax " in text
-    assert "Seeds: 3." in text
+    assert "Seed: 3." in text

@@ -337,6 +337,11 @@ def test_git_state_names_the_commit_of_this_tree(repository):
 def test_a_run_of_which_nothing_came_leaves_no_folder(tmp_path):
     RunDirectory.create(tmp_path / "empty", {}, "garat", []).discard()
     assert not (tmp_path / "empty").exists()
+    RunDirectory.create(tmp_path / "runs" / "today" / "empty", {}, "garat", []).discard()
+    assert not (tmp_path / "runs").exists()
+    (tmp_path / "mine").mkdir()
+    RunDirectory.create(tmp_path / "mine" / "empty", {}, "garat", []).discard()
+    assert (tmp_path / "mine").is_dir()
     kept = RunDirectory.create(tmp_path / "kept", {}, "garat", [])
     kept.log(1, reward=1.0)
     kept.discard()

@@ -32,7 +32,7 @@ from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
 from garat_jax.diagnosis.segments import SHORTEST, grid_for
 from garat_jax.diagnosis.separate import next_experiment
-from garat_jax.diagnosis.simulate import Simulator, simulator_of
+from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.suggest import suggest
 from garat_jax.diagnosis.unseen import is_still, unseen
@@ -63,6 +63,20 @@ def diagnose(
         shared: Effects that act besides the model's own, and of which each may be another here: one
             that is selected takes its place.
     """
+    return diagnose_keeping(model, recordings, holdout, say, shared)[0]
+
+
+def diagnose_keeping(
+    model: Model,
+    recordings: Sequence[Recording],
+    holdout: Sequence[Recording],
+    say: Callable[[str], None],
+    shared: Sequence[Effect] = (),
+) -> tuple[Diagnosis, Simulator]:
+    """Return a diagnosis and the simulator that made it, whose programs are compiled.
+
+    Args are those of `diagnose`.
+    """
     started = time.monotonic()
     fitted, held_out, how = split(checked(recordings), checked(holdout, least=0))
     everything = thin((*fitted, *held_out))
@@ -75,7 +89,7 @@ def diagnose(
     plain = Simulator(whole, (), grid)
     horizon, segments = choose_horizon(plain, everything, grid, num_fitted=len(fitted))
     say(say_horizon(everything, horizon))
-    simulator = simulator_of(model, (*shared, *others), grid, tuple(range(len(shared))))
+    simulator = Simulator(model, (*shared, *others), grid, acting=range(len(shared)))
     warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
     warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, everything, grid, horizon)
@@ -119,7 +133,8 @@ def diagnose(
         left=(),
     )
     left = leftover(problem, outcome.after, everything, host) if found.is_left else ()
-    return dataclasses.replace(found, left=tuple(left), seconds=time.monotonic() - started)
+    found = dataclasses.replace(found, left=tuple(left), seconds=time.monotonic() - started)
+    return found, simulator
 
 
 def split(recordings: Sequence[Recording], holdout: Sequence[Recording]):

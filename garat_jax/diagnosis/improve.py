@@ -12,9 +12,9 @@ import plotly.graph_objects as go
 from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.conditions import add_conditions, read_conditions, write_cards
-from garat_jax.diagnosis.diagnose import diagnose, split, thin
+from garat_jax.diagnosis.diagnose import diagnose, make_candidates, split, thin
 from garat_jax.diagnosis.export import copy_model, needed_files
-from garat_jax.diagnosis.findings import Candidate, apart
+from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.held_out import are_explained, errors_of, longest_errors
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
@@ -22,7 +22,7 @@ from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import progress
-from garat_jax.diagnosis.repeat import found_theta, nominal_effects, repeatability
+from garat_jax.diagnosis.repeat import found_theta, repeatability
 from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosis_sections
 from garat_jax.diagnosis.report_conditions import condition_sections
 from garat_jax.diagnosis.results import Diagnosis, Rung, Verdict
@@ -160,8 +160,8 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
     grid = grid_for(everything, model.compile(engine="mujoco").host.model)
-    effects = nominal_effects(model, added)
-    simulator = Simulator(model, effects, grid)
+    offered = {Named(e.kind, e.target): e for e in make_candidates(model)}
+    simulator = Simulator(model, [offered[candidate.named] for candidate in added], grid)
     _, segments = choose_horizon(simulator, everything, grid)
     seen = segments.recording < len(fitted)
     problem = Problem(simulator, segments, seen, grid.sample)

@@ -32,9 +32,9 @@ SAME_INTERVAL = 0.1
 EFFECT_KEYS = ("kind", "target", "parameters")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class Model:
-    """A model with overrides and effects; equal to itself alone, as its editable model is.
+    """A model with overrides and effects.
 
     Attributes:
         name: The file's name without its ending.

@@ -5,6 +5,7 @@ and by the rivals that promise more.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -18,30 +19,24 @@ from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import TOO_CLOSE
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import make_metric
-from garat_jax.diagnosis.model_card import Model, make_effect
+from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.segments import grid_for
-from garat_jax.diagnosis.simulate import Simulator, simulator_of
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import Fit, settle
-from garat_jax.diagnosis.timestep import count_timestep
+from garat_jax.diagnosis.timestep import REFITTED, count_timestep
 from garat_jax.dynamics import native_model
-from garat_jax.effects import Effect
 
 SIGNIFICANCE = 0.01
 """Smallest p-value of equal sizes (Cochran's Q) at which recordings still count as agreeing."""
 NUM_RIVALS = 3
 """Effects that a recording may need instead; scores of a few take less time than the fits."""
-
-
-def nominal_effects(model: Model, selected: Sequence[Candidate]) -> tuple[Effect, ...]:
-    """Return the effects that a diagnosis found, each of no size yet."""
-    classes = [(model.catalogue[c.effect], c.target) for c in selected]
-    return tuple(
-        make_effect(cls, target, {p.name: p.nominal for p in cls.parameters()})
-        for cls, target in classes
-    )
+NUM_REFITTED = REFITTED // 2
+"""Segments of a recording that are fitted again at finer timesteps, at least: with those of all
+recordings, which are fitted one after another, that took several times as long as the diagnosis."""
 
 
 def found_theta(simulator: Simulator, selected: Sequence[Candidate]) -> np.ndarray:
@@ -50,9 +45,9 @@ def found_theta(simulator: Simulator, selected: Sequence[Candidate]) -> np.ndarr
     theta = simulator.base.copy()
     for j, slot in enumerate(simulator.slots):
         effect = simulator.effects[slot.effect]
-        candidate = found.get(Named(effect.kind, effect.target))
-        if candidate and slot.parameter.name in candidate.parameters:
-            theta[j] = candidate.parameters[slot.parameter.name].estimate
+        if candidate := found.get(Named(effect.kind, effect.target)):
+            estimate = candidate.parameters.get(slot.parameter.name)
+            theta[j] = estimate.estimate if estimate else slot.parameter.nominal
     return theta
 
 
@@ -63,6 +58,7 @@ def repeatability(
     holdout: Sequence[Recording] = (),
     conditions: Mapping[str, Sequence[Recording]] | None = None,
     say: Callable[[str], None] = lambda message: None,
+    simulator: Simulator | None = None,
 ) -> Diagnosis:
     """Return a diagnosis with what each recording alone shows of the effects that it found.
 
@@ -76,12 +72,15 @@ def repeatability(
         holdout: Those that it was given to hold out.
         conditions: Those of other conditions that it was given.
         say: Told what is being done.
+        simulator: What made the diagnosis of these recordings, if it is kept; its programs are
+            compiled.
     """
-    seen = _alone(model, split(recordings, holdout), found.selected, found.candidates, say)
+    everything = thin(list(itertools.chain(*split(recordings, holdout)[:2])))
+    seen = _alone(model, everything, found.selected, found.candidates, say, simulator)
     others = {}
     for name, other in found.conditions.items():
         own = {c.named for c in other.selected}
-        measured = split((conditions or {})[name], ())
+        measured = thin(list(itertools.chain(*split((conditions or {})[name], ())[:2])))
         rivals = (*other.candidates, *found.candidates)
         there = _alone(model, measured, found.under(name), rivals, say)
         for parameter in seen:
@@ -101,36 +100,41 @@ class _Parameter(NamedTuple):
 
 
 def _alone(
-    model: Model, parts, selected: Sequence[Candidate], candidates: Sequence[Candidate], say
+    model: Model,
+    everything: Sequence[Recording],
+    selected: Sequence[Candidate],
+    candidates: Sequence[Candidate],
+    say: Callable[[str], None],
+    simulator: Simulator | None = None,
 ) -> dict[_Parameter, list[Sighting]]:
     """Fit the effects selected to each recording alone.
 
     Args:
         model: The model without them.
-        parts: What `split` returned.
+        everything: The recordings.
         selected: All effects that act in these recordings.
         candidates: Best first; the first of them that were not selected are the rivals.
         say: Told what is being done.
+        simulator: See `repeatability`.
     """
     if not selected:
         return {}
-    everything = thin((*parts[0], *parts[1]))
     host = native_model(model.compile(engine="mujoco"))
     grid = grid_for(everything, host)
-    simulator = simulator_of(model, make_candidates(model), grid, ())
+    simulator = simulator or Simulator(model, make_candidates(model), grid)
     theta = found_theta(simulator, selected)
-    place = {Named(e.kind, e.target): i for i, e in enumerate(simulator.effects)}
-    acting = {place[c.named]: c for c in selected}
-    rivals = {place[named] for named in _rivals(selected, candidates) if named in place}
-    skip = [i for i in place.values() if i not in rivals]
+    index = {Named(e.kind, e.target): i for i, e in enumerate(simulator.effects)}
+    acting = [index[c.named] for c in selected]
+    rivals = {index[named] for named in _rivals(selected, candidates) if named in index}
+    skip = [i for i in index.values() if i not in rivals]
     _, segments = choose_horizon(simulator, everything, grid)
     everywhere = np.ones(len(segments.start), bool)
     whole = Problem(simulator, segments, everywhere, grid.sample)
     free = {
-        j: _Parameter(acting[slot.effect].named, slot.parameter.name, estimate.unit)
-        for j, slot in enumerate(simulator.slots)
-        if slot.effect in acting
-        and (estimate := acting[slot.effect].parameters.get(slot.parameter.name))
+        j: _Parameter(candidate.named, name, estimate.unit)
+        for number, candidate in zip(acting, selected, strict=True)
+        for name, j in columns_of(simulator.slots, number).items()
+        if (estimate := candidate.parameters.get(name))
         and np.isfinite(estimate.high - estimate.low)
     }
     longer = cut_longer(whole, everything, grid, theta)
@@ -142,7 +146,7 @@ def _alone(
         alone = whole.take(own)
         found = fit(alone, theta, settled.start[own], free)
         needs = {number: _need(alone, found, number, skip) for number in acting}
-        fitted = count_timestep(alone, found)
+        fitted = count_timestep(alone, found, NUM_REFITTED)
         for place, (j, parameter) in enumerate(free.items()):
             seen = j not in fitted.frozen
             numbers = (fitted.theta[j], fitted.low[place], fitted.high[place])

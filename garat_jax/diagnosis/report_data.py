@@ -167,12 +167,11 @@ def repeatability_section(diagnosis: Diagnosis) -> list[Section]:
         return []
     rows = [
         (
-            f"{r.effect.replace('_', ' ')} at {r.target}{where}",
-            f"{r.parameter} [{r.unit}]" if r.unit not in ("", "1") else r.parameter,
+            f"{r.effect.replace('_', ' ')} at {r.target}{where}: {r.parameter}"
+            + (f" [{r.unit}]" if r.unit not in ("", "1") else ""),
             s.recording,
             s.estimate,
-            s.low,
-            s.high,
+            f"{s.low:.4g} to {s.high:.4g}" if np.isfinite(s.estimate) else "–",
             100 * s.error_without,
             100 * s.error_with,
             _words(s.ahead) or "none",
@@ -192,8 +191,8 @@ def repeatability_section(diagnosis: Diagnosis) -> list[Section]:
                 f"(p = {r.p_value:.2g}); the effect may change with time, temperature or load, or "
                 "stand in for another one."
             )
-    columns = ["effect", "parameter", "recording", "estimate", "low", "high"]
-    columns += ["error without [%]", "error with [%]", "rivals ahead"]
+    columns = ["effect", "recording", "estimate", "95 % interval"]
+    columns += ["error without [%]", "with it [%]", "rivals ahead"]
     horizons = {s.horizon: None for r, _ in found for s in r.recordings}
     followed = " or ".join(f"{horizon:.2g}" for horizon in horizons)
     caption = (

@@ -8,7 +8,8 @@ from typing import NamedTuple
 from rich.console import Console
 
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.conditions import diagnose_conditions, read_conditions, write_cards
+from garat_jax.diagnosis.conditions import add_conditions, read_conditions, write_cards
+from garat_jax.diagnosis.diagnose import diagnose_keeping
 from garat_jax.diagnosis.export import copy_model
 from garat_jax.diagnosis.model_card import load_model
 from garat_jax.diagnosis.progress import progress
@@ -59,8 +60,11 @@ def run_diagnose(
     others = read_conditions(loaded, conditions, columns)
     copied = copy_model(loaded, run.path("model")) if others else loaded.mjcf
     with progress("looking at the recordings") as say:
-        diagnosis = diagnose_conditions(loaded, recordings, others, held_out, say)
-        diagnosis = repeatability(loaded, diagnosis, recordings, held_out, others, say)
+        base, simulator = diagnose_keeping(loaded, recordings, held_out, say)
+        diagnosis = add_conditions(loaded, base, recordings, others, held_out, say)
+        diagnosis = repeatability(
+            loaded, diagnosis, recordings, held_out, others, say, simulator=simulator
+        )
         run.write_json("diagnosis.json", diagnosis.to_json())
         if others:
             write_cards(run, dataclasses.replace(loaded, mjcf=copied), diagnosis)

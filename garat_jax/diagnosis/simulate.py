@@ -36,8 +36,8 @@ and a diagnosis has two simulators, of up to two batch sizes a program, and five
 FEW = 4
 """Candidates up to which a program with calls a substep is optimised. In those that fit them, which
 run often, few act; in those of screening, which run a few times, as many as a model has places for
-them. One of whole segments is optimised always: memories of commands would take most of its time.
-"""
+them. One of whole segments in which nothing looks at the state is optimised always: memories of
+commands would take most of its time."""
 
 
 class Simulator:
@@ -97,7 +97,6 @@ class Simulator:
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
         self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
         self._plain = tuple(i for i in self._blind if self._is_memoryless(replayed[i]))
-        self._recalling = tuple(i for i in self._blind if i not in self._plain)
         self._transform = model.transform
         self._follower = Follower(self.host, grid.interval)
         self._any_at_once = dynamics.steps_at_once(self._alone) and model.transform is None
@@ -123,8 +122,9 @@ class Simulator:
             own = jax.tree.map(jnp.asarray, self._model.effects)
         return world.replace(effects=tuple(effect.as_replayed() for effect in own))
 
-    def _is_memoryless(self, effect: Effect) -> bool:
-        return not effect.notes and not jax.tree.leaves(effect.init(self.host))
+    @staticmethod
+    def _is_memoryless(effect: Effect) -> bool:
+        return not effect.notes and type(effect).init is Effect.init
 
     def predict(self, theta: np.ndarray, start: np.ndarray, segments: Segments) -> np.ndarray:
         """Predict every segment's signals.
@@ -171,13 +171,13 @@ class Simulator:
         program = self._program(self._acting(base[None]))
         alone, path = self._batches(program, segments, base[None], start[None]).run()
         calls = []
-        for (way, moving), rows in self._ways(theta, base).items():
+        for (way, _), rows in self._ways(theta, base).items():
             both = np.concatenate([base[None], theta[rows]])
             starts = np.broadcast_to(start, (len(both), *start.shape))
             chosen = self._acting(both)
-            if way == "at once":  # all that move so share a program
-                alike = self._recalling if moving else self._plain
-                chosen = tuple(sorted({*alike, *chosen}))
+            if way == "at once":  # one program for all that are plain, one for all that are blind
+                is_plain = {*chosen} <= {*self._plain}
+                chosen = self._plain if is_plain else self._blind
             if way == "along":
                 run, along = self._jitted("along", chosen), path[0]
             else:
@@ -212,7 +212,7 @@ class Simulator:
             kinds = " ".join(sorted({self.effects[j].kind for j in moved - blind}))
             acting = {*self._acting(np.stack([base, row]))}
             if self._any_at_once and acting <= blind:
-                way = ("at once", "" if moved <= {*self._plain} else "memories of commands")
+                way = ("at once", "" if acting <= {*self._plain} else "with a memory")
             elif self._any_at_once and moved <= memoryless and acting <= memoryless:
                 way = ("along", kinds)
             else:
@@ -359,14 +359,6 @@ class Simulator:
         below = jnp.minimum(place.astype(int), len(path) - 2)
         fraction = (place - below)[:, None]
         return (1 - fraction) * path[below] + fraction * path[below + 1]
-
-
-@functools.lru_cache(maxsize=1)
-def simulator_of(
-    model: Model, candidates: tuple[Effect, ...], grid: Grid, acting: tuple[int, ...]
-) -> Simulator:
-    """Return a `Simulator`; the last is kept, with its programs, for another look at the same."""
-    return Simulator(model, candidates, grid, acting=acting)
 
 
 def _any_stays_finite(signals: np.ndarray) -> bool:

@@ -34,7 +34,7 @@ REFINED = 4
 REFINEMENTS = 2
 """Largest number of finer timesteps at which is fitted."""
 REFITTED = 24
-"""Segments that are fitted again, at least."""
+"""Segments of all recordings that are fitted again, at least."""
 IN_A_ROW = 4
 """Of these, those that follow each other: one says where the next begins."""
 LOST = 10.0
@@ -45,7 +45,7 @@ SETTLED = 0.4
 tried: a timestep of 0 changes a third of that."""
 
 
-def count_timestep(problem: Problem, fitted: Fit) -> Fit:
+def count_timestep(problem: Problem, fitted: Fit, num_refitted: int = REFITTED) -> Fit:
     """Move the estimates to where a timestep of 0 would have them, and the intervals with them.
 
     At the model's own timestep a parameter also makes up for the integrator's error, which may be
@@ -56,20 +56,25 @@ def count_timestep(problem: Problem, fitted: Fit) -> Fit:
     surface through a rough cost counts (see `smooth_minimum`); where that is not extrapolated, fits
     at the whole and at half the timestep say how far it is from one at 0, and intervals reach as
     far.
+
+    Args:
+        problem: What is fitted.
+        fitted: The fit.
+        num_refitted: Segments that are fitted again where that is needed, at least.
     """
     excited = _excited(fitted)
     if not np.any(excited) or not are_determined(problem, excited):
         return fitted
     differences = clear_differences(problem, fitted.theta, fitted.start, fitted.free)
     if not _are_smooth(differences, excited) and _is_coarse(problem, fitted):
-        return _at_finer_timesteps(problem, fitted)
+        return _at_finer_timesteps(problem, fitted, num_refitted)
     fitted, lin, rough = _at_minimum(problem, fitted, differences)
     if moved := _extrapolated(problem, fitted, lin, rough):
         return moved
     if _is_coarse(problem, fitted):
-        return _at_finer_timesteps(problem, fitted)
+        return _at_finer_timesteps(problem, fitted, num_refitted)
     low, high = _interval(problem, fitted.theta, fitted, lin, rough)
-    shift = _shift_by_fits(problem, fitted)
+    shift = _shift_by_fits(problem, fitted, num_refitted)
     low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
     return dataclasses.replace(fitted, low=low, high=high)
 
@@ -153,7 +158,7 @@ def _extrapolated(
     return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
 
 
-def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
+def _at_finer_timesteps(problem: Problem, fitted: Fit, num_refitted: int) -> Fit:
     """Return a fit as ever finer timesteps have it, until a timestep of 0 would hardly change it.
 
     The integrator's error falls with the timestep. But contacts hold a fit back on its way, so that
@@ -164,7 +169,7 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit) -> Fit:
     """
     excited = _excited(fitted)
     free = np.asarray(fitted.free)[excited]
-    chosen = _chosen(problem)
+    chosen = _chosen(problem, num_refitted)
     some, near = problem.take(chosen), fitted.take(chosen)
     coarse, change = _left(some, near), np.zeros(len(free))
     half = half_before = (fitted.high - fitted.low)[excited] / 2
@@ -204,14 +209,14 @@ def _left(problem: Problem, fitted: Fit) -> float:
     return float(fitted.cost.sum() / problem.expected.sum())
 
 
-def _chosen(problem: Problem) -> np.ndarray:
+def _chosen(problem: Problem, num: int) -> np.ndarray:
     """Return the indices of the segments that are fitted again, evenly chosen.
 
     Of a recording that is left out, the first count, too: it may be the only one of a condition.
     """
     fitted = np.flatnonzero(problem.fitted)
     recordings = problem.segments.recording[fitted]
-    apart = max(1, len(fitted) // REFITTED)
+    apart = max(1, len(fitted) // num)
     is_chosen = np.arange(len(fitted)) // IN_A_ROW % apart == 0
     for recording in np.setdiff1d(recordings, recordings[is_chosen]):
         is_chosen[np.flatnonzero(recordings == recording)[:IN_A_ROW]] = True
@@ -236,12 +241,12 @@ def _finer(problem: Problem, near: Fit) -> tuple[Problem, Fit]:
     return trusted(finer, settled), settled
 
 
-def _shift_by_fits(problem: Problem, near: Fit) -> np.ndarray:
+def _shift_by_fits(problem: Problem, near: Fit, num_refitted: int) -> np.ndarray:
     """Return how far a timestep of 0 moves the free parameters, by fits at the whole and at half.
 
     Some segments say it, evenly chosen.
     """
-    chosen = _chosen(problem)
+    chosen = _chosen(problem, num_refitted)
     problem, near = problem.take(chosen), near.take(chosen)
 
     def fitted_by(simulator) -> np.ndarray:

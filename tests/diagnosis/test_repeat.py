@@ -29,7 +29,7 @@ def test_a_recording_that_asks_for_another_effect_is_named():
     assert "2 of 3 recordings ask for it; odd for torque offset at joint/hinge." in section.text
     (table,) = section.tables
     assert f"followed for {stranger.horizon:.2g} s at a time" in table.caption
-    assert np.isclose(table.rows[0][6], 100 * damping.recordings[0].error_without)
+    assert np.isclose(table.rows[0][4], 100 * damping.recordings[0].error_without)
     assert again.to_json()["repeatability"][0]["recordings"][1]["ahead"] == [
         {"effect": "torque_offset", "target": "joint/hinge"}
     ]

@@ -48,6 +48,19 @@ class Broken(MotorGain):
         return jnp.where(memory < 10, ctrl, jnp.nan), None, memory + 1
 
 
+@struct.dataclass
+class Marked(MotorGain):
+    """A gain that remembers where a site is that it adds."""
+
+    kind: ClassVar[str] = "marked"
+
+    def prepare(self, spec):
+        spec.worldbody.add_site(name="mark", pos=[0.0, 0.0, 1.0])
+
+    def init(self, host):
+        return jnp.asarray(host.site("mark").pos[2])
+
+
 def make_simulator(mjcf: str, candidates: Sequence[Effect] = ()):
     """Return a model with candidates, or every one, in segments where it falls and is pushed."""
     model = Model("model", __file__, __file__, models.spec(mjcf))
@@ -131,7 +144,7 @@ def test_an_effect_that_breaks_the_model_at_its_nominal_is_named():
         simulator.linear_change(theta[None], simulator.base, segments.start, segments)
 
 
-def test_effects_that_remember_commands_have_a_program_of_their_own():
+def test_effects_with_a_memory_of_commands_have_a_program_of_their_own():
     effects = (
         MotorGain("actuator/shoulder"),
         ViscousDamping("joint/elbow"),
@@ -155,3 +168,11 @@ def test_effects_that_remember_commands_have_a_program_of_their_own():
     starts = np.stack([segments.start] * 2)
     before, after = simulator.predict(both, starts, segments)
     np.testing.assert_allclose(change, after - before, atol=1e-9)
+    assert simulator._jitted.cache_info().currsize <= 6  # of changes: plain, blind
+
+
+def test_effects_whose_memory_needs_what_they_prepare_are_screened():
+    simulator, segments = make_simulator(models.PENDULUM, (Marked("actuator/motor"),))
+    moved = simulator.base + 0.1
+    change = simulator.linear_change(moved[None], simulator.base, segments.start, segments)
+    assert np.abs(change).max() > 1e-3

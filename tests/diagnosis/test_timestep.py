@@ -78,15 +78,15 @@ def test_fits_at_the_whole_and_half_the_timestep_say_how_far_the_whole_is_from_n
     problem = dataclasses.replace(problem, simulator=Shifted(problem.simulator, 0.004))
     found = converged(problem, np.array([0.02]))
     assert found.theta[0] == pytest.approx(0.016, rel=0.05)
-    assert timestep._shift_by_fits(problem, found)[0] == pytest.approx(0.004, rel=0.05)
-    finer = timestep._at_finer_timesteps(problem, found)
+    assert timestep._shift_by_fits(problem, found, 24)[0] == pytest.approx(0.004, rel=0.05)
+    finer = timestep._at_finer_timesteps(problem, found, 24)
     assert finer.theta[0] == pytest.approx(0.02 - 0.004 / 16, rel=0.03)
     assert finer.low[0] < 0.02 < finer.high[0]
 
 
 def test_across_contacts_every_finer_fit_is_taken_to_the_middle_of_its_dips(monkeypatch):
     problem, found = damped(noise=1e-3)
-    exact, asked = timestep._at_finer_timesteps(problem, found), []
+    exact, asked = timestep._at_finer_timesteps(problem, found, 24), []
     off, rough = 1e-3, 5e-3
 
     def smoothed(some, near, columns, covariance, sure):
@@ -95,7 +95,7 @@ def test_across_contacts_every_finer_fit_is_taken_to_the_middle_of_its_dips(monk
 
     monkeypatch.setattr(timestep, "_are_smooth", lambda *_: False)
     monkeypatch.setattr(timestep, "smooth_minimum", smoothed)
-    counted = timestep._at_finer_timesteps(problem, found)
+    counted = timestep._at_finer_timesteps(problem, found, 24)
     assert asked[0] is problem.simulator.refined(timestep.REFINED)
     assert counted.theta[0] == pytest.approx(exact.theta[0] + off, abs=0.3 * off)
     assert exact.high[0] < exact.theta[0] + 0.5 * rough
@@ -120,7 +120,7 @@ def test_segments_that_are_fitted_again_are_of_every_recording():
     recordings = [record(np.arange(6000) * 0.004), record(np.arange(400) * 0.004, seed=1)]
     problem = make_problem(recordings, [ViscousDamping("joint/hinge")], horizon=0.2)
     problem = dataclasses.replace(problem, fitted=problem.fitted & (problem.segments.first > 0))
-    chosen = timestep._chosen(problem)
+    chosen = timestep._chosen(problem, 24)
     assert timestep.REFITTED <= len(chosen) < 2.5 * timestep.REFITTED
     assert np.all(problem.fitted[chosen])
     assert set(problem.segments.recording[chosen]) == {0, 1}
