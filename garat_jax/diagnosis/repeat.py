@@ -5,7 +5,6 @@ and by the rivals that promise more.
 """
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -75,12 +74,12 @@ def repeatability(
         simulator: What made the diagnosis of these recordings, if it is kept; its programs are
             compiled.
     """
-    everything = thin(list(itertools.chain(*split(recordings, holdout)[:2])))
-    seen = _alone(model, everything, found.selected, found.candidates, say, simulator)
+    parts = split(recordings, holdout)
+    seen = _alone(model, parts, found.selected, found.candidates, say, simulator)
     others = {}
     for name, other in found.conditions.items():
         own = {c.named for c in other.selected}
-        measured = thin(list(itertools.chain(*split((conditions or {})[name], ())[:2])))
+        measured = split((conditions or {})[name], ())
         rivals = (*other.candidates, *found.candidates)
         there = _alone(model, measured, found.under(name), rivals, say)
         for parameter in seen:
@@ -101,7 +100,7 @@ class _Parameter(NamedTuple):
 
 def _alone(
     model: Model,
-    everything: Sequence[Recording],
+    parts,
     selected: Sequence[Candidate],
     candidates: Sequence[Candidate],
     say: Callable[[str], None],
@@ -111,7 +110,7 @@ def _alone(
 
     Args:
         model: The model without them.
-        everything: The recordings.
+        parts: What `split` returned.
         selected: All effects that act in these recordings.
         candidates: Best first; the first of them that were not selected are the rivals.
         say: Told what is being done.
@@ -119,6 +118,7 @@ def _alone(
     """
     if not selected:
         return {}
+    everything = thin((*parts[0], *parts[1]))
     host = native_model(model.compile(engine="mujoco"))
     grid = grid_for(everything, host)
     simulator = simulator or Simulator(model, make_candidates(model), grid)

@@ -171,13 +171,12 @@ class Simulator:
         program = self._program(self._acting(base[None]))
         alone, path = self._batches(program, segments, base[None], start[None]).run()
         calls = []
-        for (way, _), rows in self._ways(theta, base).items():
+        for (way, more), rows in self._ways(theta, base).items():
             both = np.concatenate([base[None], theta[rows]])
             starts = np.broadcast_to(start, (len(both), *start.shape))
             chosen = self._acting(both)
-            if way == "at once":  # one program for all that are plain, one for all that are blind
-                is_plain = {*chosen} <= {*self._plain}
-                chosen = self._plain if is_plain else self._blind
+            if way == "at once":  # a program for all that are plain, one for all that are blind
+                chosen = self._blind if more else self._plain
             if way == "along":
                 run, along = self._jitted("along", chosen), path[0]
             else:
@@ -204,7 +203,10 @@ class Simulator:
         return UserError(f"no simulation with {named} stays finite, even at its nominal")
 
     def _ways(self, theta: np.ndarray, base: np.ndarray) -> dict[tuple[str, str], list[int]]:
-        """Sort rows by how their change is had, and by what moves that looks at the state."""
+        """Sort rows by how their change is had, and by what more sets programs apart.
+
+        That is what moves that looks at the state, or that something has a memory of commands.
+        """
         ways: dict[tuple[str, str], list[int]] = {}
         blind, memoryless = {*self._blind}, {*self._blind, *self._memoryless}
         for i, row in enumerate(theta):
