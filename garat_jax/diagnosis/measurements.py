@@ -31,6 +31,13 @@ from garat_jax.errors import UserError, nearest, unknown_name
 
 GAP = 5.0
 """A step longer than this many median steps is a gap."""
+_PURPOSES = {
+    "time": "the time of each sample in seconds",
+    "qpos": "the position of every joint is needed",
+    "ctrl": "the command of every actuator is needed; write 0 where it was off",
+    "qvel": "give the velocity of every joint, or of none and it is estimated",
+}
+"""What columns are for, or that all of them are needed, by what their names begin with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,17 +180,14 @@ def _check_columns(table: Table, model: mujoco.MjModel) -> bool:
     commands = ["ctrl." + name for name in actuator_names(model)]
     known = ["time", *positions, *velocities, *commands, *(s.name for s in torques(model))]
     _check_actuators(table, commands)
-    for name in table.columns:
-        if name not in known:
-            unknown = unknown_name("column", name, known)
-            raise UserError(
-                f"{table.path}: {unknown} (--map renames columns and leaves others out)"
-            )
     measured = any(name in table.columns for name in velocities)
     wanted = ["time", *positions, *commands, *(velocities if measured else [])]
-    for name in wanted:
-        if name not in table.columns:
-            raise _missing(table, name, wanted)
+    missing = [name for name in wanted if name not in table.columns]
+    for name in table.columns:
+        if name not in known:
+            raise _unknown(table, name, known, missing)
+    if missing:
+        raise _missing(table, missing[0], wanted)
     return measured
 
 
@@ -199,17 +203,21 @@ def _check_actuators(table: Table, commands: list[str]) -> None:
     )
 
 
+def _unknown(table: Table, name: str, known: Collection[str], missing: list[str]) -> UserError:
+    """Describe a column that is none of the model's, beside one that lacks."""
+    way = "--map renames columns and leaves others out"
+    if missing and not nearest(name, missing):
+        lack = f"{missing[0]!r} is missing ({_PURPOSES[missing[0].partition('.')[0]]})"
+        return UserError(f"{table.path}: unknown column {name!r}, and {lack}; {way}")
+    return UserError(f"{table.path}: {unknown_name('column', name, missing or known)} ({way})")
+
+
 def _missing(table: Table, name: str, wanted: Collection[str]) -> UserError:
     """Describe a column that lacks; of those `wanted`, none is another's misspelt name."""
-    reason = {
-        "time": "the time of each sample in seconds",
-        "qpos": "the position of every joint is needed",
-        "ctrl": "the command of every actuator is needed; write 0 where it was off",
-        "qvel": "give the velocity of every joint, or of none and it is estimated",
-    }[name.partition(".")[0]]
+    purpose = _PURPOSES[name.partition(".")[0]]
     close = nearest(name, [column for column in table.columns if column not in wanted])
     there = f"nearest is {close[0]}" if close else f"there are {', '.join(table.columns)}"
-    return UserError(f"{table.path}: missing column {name!r} ({reason}); {there}")
+    return UserError(f"{table.path}: missing column {name!r} ({purpose}); {there}")
 
 
 def _split(path: Path, time: np.ndarray) -> tuple[tuple[tuple[int, int], ...], list[str]]:

@@ -230,7 +230,8 @@ def _errors(error: Errors, view: View) -> Section:
         "The recordings are cut into short segments. The model starts each one from the state that "
         "fits the segment best and is given the recorded commands; what it then predicts is "
         "compared with what was measured. An error of 100 % of the spread is as bad as always "
-        f"predicting the signal's mean.\n\nThe error stated in this report is the {error.metric}.",
+        "predicting the signal's mean; the spread is that of the recordings on which the error is "
+        f"measured.\n\nThe error stated in this report is the {error.metric}.",
         figures=[
             Figure(
                 figures.errors_by_horizon(before, after, error.noise_floor),

@@ -105,6 +105,19 @@ def test_unknown_column_names_the_nearest(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("wanted", "written"), [("ctrl.motor", "torque"), ("time", "t"), ("time", "time_s")]
+)
+def test_foreign_column_is_named_beside_the_one_that_lacks(tmp_path, wanted, written):
+    table = columns()
+    table[written] = table.pop(wanted)
+    message = refusal(save(tmp_path, table))
+    assert f"unknown column '{written}'" in message
+    assert wanted in message
+    assert "torque.hinge" not in message
+    assert "--map renames columns" in message
+
+
+@pytest.mark.parametrize(
     ("name", "said"),
     [
         ("time", "the time of each sample in seconds"),
