@@ -10,7 +10,7 @@ Device = Literal["auto", "cpu", "gpu", "tpu"]
 
 @dataclasses.dataclass(frozen=True)
 class Doctor:
-    """Say what this machine offers, measure both engines for 5 s, and give advice."""
+    """Say what this machine offers, measure both engines for 5 s once compiled, and advise."""
 
     device: Device = "auto"
     """What computes."""
