@@ -15,8 +15,14 @@ from garat_jax.diagnosis.differences import (
     is_erratic,
     projected,
 )
-from garat_jax.diagnosis.problem import Linearisation, Problem, block_labels, linearise
-from garat_jax.diagnosis.robust import regress
+from garat_jax.diagnosis.problem import (
+    Linearisation,
+    Problem,
+    block_labels,
+    block_stretches,
+    linearise,
+)
+from garat_jax.diagnosis.robust import jackknife
 from garat_jax.diagnosis.starts import (
     SETTLE_STEPS,
     Fit,
@@ -236,7 +242,7 @@ def _search(problem: Problem, near: Fit, free, relative) -> np.ndarray:
 
 
 def interval(problem: Problem, theta, lin: Linearisation, free, keep):
-    """Return 95 % intervals: robust, with blocks of time as the independent units."""
+    """Return 95 % intervals: robust, where errors last within blocks of time and beyond."""
     low, high = np.full(len(free), -np.inf), np.full(len(free), np.inf)
     if not np.any(keep) or not are_determined(problem, keep):
         return low, high
@@ -256,5 +262,5 @@ def uncertainty(problem: Problem, lin: Linearisation, keep) -> tuple[np.ndarray,
     """Return the covariance of the excited parameters, and standard deviations in a half-width."""
     sensitivity, residual = projected(problem, lin)
     labels = block_labels(problem)[problem.fitted].ravel()
-    found = regress(sensitivity[:, keep], residual, labels)
+    found = jackknife(sensitivity[:, keep], residual, labels, block_stretches(problem))
     return found.covariance, float(stats.t.ppf(0.975, found.freedom))

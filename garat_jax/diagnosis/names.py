@@ -16,8 +16,8 @@ SAME = 1.0 - 1e-9
 
 def twins(score: Score, others: Sequence[Score]) -> list[Score]:
     """Return those of the others that change the very same where screened, at the same sizes."""
-    same = [s for s in others if len(s.size) == len(score.size) and cosine(score, s) > SAME]
-    return [s for s in same if np.allclose(s.size, score.size)]
+    same = [s for s in others if len(s.size) == len(score.size) and np.allclose(s.size, score.size)]
+    return [s for s in same if cosine(score, s) > SAME]
 
 
 def is_predicted(problem: Problem, fitted: Fit) -> bool:

@@ -276,6 +276,11 @@ def block_labels(problem: Problem) -> np.ndarray:
     return np.arange(len(problem.fitted))[:, None] * (blocks.max() + 1) + blocks
 
 
+def block_stretches(problem: Problem) -> np.ndarray:
+    """Return the stretch of segments in which the block with each label lies, [labels]."""
+    return np.repeat(problem.segments.stretch, problem.blocks().max() + 1)
+
+
 def tall(columns: np.ndarray) -> np.ndarray:
     """Turn columns [S, N, k] into [S * N, k]."""
     return columns.reshape(columns.shape[0] * columns.shape[1], columns.shape[2])

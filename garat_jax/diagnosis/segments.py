@@ -94,6 +94,13 @@ class Segments:
         steps = 1.0 + np.max(self.place * self.weight, axis=1, initial=0.0)
         return 2 * steps >= min(self.lasts, steps.max(initial=0.0))
 
+    @property
+    def stretch(self) -> np.ndarray:
+        """Number the stretches of segments that follow each other, if over a gap, [S]."""
+        ends = self.first + np.count_nonzero(self.weight, axis=1)
+        is_new = (self.recording[1:] != self.recording[:-1]) | (self.first[1:] != ends[:-1])
+        return np.concatenate([[0], np.cumsum(is_new)])
+
     def take(self, chosen: np.ndarray) -> "Segments":
         """Return some of the segments; noise, spread, units and past stay those of all."""
         by_segment = ("measured", "weight", "observed", "trust", "start", "ctrl", "place")

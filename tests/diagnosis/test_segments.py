@@ -61,6 +61,13 @@ def test_a_rest_of_a_recording_is_not_whole():
     assert segments.is_whole.tolist() == [True] * 4 + [False]
 
 
+def test_segments_that_follow_each_other_are_a_stretch():
+    made = [sampled(np.arange(100) / 100), sampled(np.arange(60) / 100)]
+    segments = cut(made, choose_grid(made, 0.005), 0.2)
+    assert segments.stretch.tolist() == [0] * 5 + [1] * 3
+    assert segments.take(np.asarray([0, 1, 3, 4, 6])).stretch.tolist() == [0, 0, 1, 1, 2]
+
+
 @pytest.mark.parametrize("jitter", [0.0, 1e-3])
 def test_after_a_gap_the_last_command_before_it_was_held(jitter):
     time = np.arange(200) / 100 + jitter * np.random.default_rng(0).uniform(size=200)
