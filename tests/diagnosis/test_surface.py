@@ -64,14 +64,15 @@ def test_the_deepest_dip_of_a_rough_cost_is_left_for_the_middle_of_all(smooth):
     tried = found.theta + half * np.linspace(-2, 2, 41)[:, None]
     dips = sorted(follow_each(rough, tried, found), key=lambda dip: dip.cost.sum())
     errors, unsure = [], []
-    for dip in dips[:5]:
+    for dip in dips[:20]:
         middle, width = smooth_minimum(rough, dip, COLUMNS, covariance, sure)
         errors.append((dip.theta[0] - found.theta[0], middle.theta[0] - found.theta[0]))
         unsure.append(width[0])
     of_dips, of_middles = np.sqrt(np.mean(np.square(errors), axis=0))
     assert of_middles < 0.6 * of_dips
     assert np.median(unsure) > 0.2 * half
-    assert all(abs(error) < 2 * width for (_, error), width in zip(errors, unsure, strict=True))
+    inside = [abs(error) < width for (_, error), width in zip(errors, unsure, strict=True)]
+    assert np.mean(inside) > 0.75
 
 
 def test_places_keep_up_with_axes_that_are_widened_later(monkeypatch):
