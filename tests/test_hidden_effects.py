@@ -153,9 +153,11 @@ def test_commands_are_late_slow_or_lost_as_said():
     late = SECRETS["actuator_delay"]("actuator/elbow", {"delay": 20 * step})
     changed = late.command(scene.model, ctrl)
     assert (np.argmax(changed[:, 0] > 0), np.argmax(changed[:, 1] > 0)) == (100, 120)
+    between = SECRETS["actuator_delay"]("actuator/elbow", {"delay": 20.25 * step})
+    assert between.command(scene.model, ctrl)[119:122, 1] == pytest.approx([0.0, 0.75, 1.0])
     slow = SECRETS["actuator_lag"]("all", {"time_constant": 50 * step})
     changed = slow.command(scene.model, ctrl)
-    assert changed[149] == pytest.approx([1 - np.exp(-1)] * 2)
+    assert changed[149] == pytest.approx([1 - np.exp(-49.5 / 50)] * 2, abs=1e-4)
     dead = SECRETS["motor_deadband"]("actuator/elbow", {"width": 0.3})
     assert dead.command(scene.model, ctrl)[-1] == pytest.approx([1.0, 0.7])
     curve = SECRETS["motor_curve"]("actuator/elbow", {"saturation": 2.0, "linear": 1.0})
@@ -190,6 +192,28 @@ def test_a_gear_without_play_is_the_plain_joint_and_one_with_play_turns_freely_w
     alone = np.sqrt(2 * 0.1 * inertia / 0.5)  # the rotor crosses half the gap before the link moves
     assert np.all(hidden[: int(0.9 * alone * 200)] == 0)
     assert hidden[-1, 0] > 0.5 * clean[-1, 0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "robot", "target", "parameters"),
+    [
+        ("actuator_delay", "pendulum", "actuator/motor", {"delay": 0.0123}),
+        ("actuator_lag", "pendulum", "actuator/motor", {"time_constant": 0.0151}),
+        ("sensor_delay", "pendulum", "all", {"delay": 0.0123}),
+        ("backlash", "arm6", "joint/yaw", {"gap": 0.012}),
+    ],
+)
+def test_a_finer_timestep_would_measure_the_same(kind, robot, target, parameters, monkeypatch):
+    """Within the sensors' noise; a light link behind a play once shook, and delays were rounded."""
+    secret, scene = made(kind, robot, target, **parameters)
+    time, ctrl = experiment(scene, 0, 250.0, 1.0, (0, 1))
+    found = measure(scene, (secret,), time, ctrl, 0.0)
+    monkeypatch.setattr("benchmarks.hidden.measure.finer_timestep", lambda *given: 1 / 128_000)
+    finer = measure(scene, (secret,), time, ctrl, 0.0)
+    error = np.sqrt(np.mean((found - finer) ** 2, axis=0))
+    assert np.all(error < np.repeat(scene.robot.noise, scene.model.nv))
+    if robot == "pendulum":
+        assert np.all(error < 1e-4 * found.std(axis=0))
 
 
 @pytest.mark.parametrize("noise", ["white", "coloured", "quantised"])

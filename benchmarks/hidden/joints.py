@@ -8,7 +8,7 @@ from .secrets import AtDrivenJoint, AtJoint, jitter, signed, slide
 
 SMALLEST_FRICTION = 1e-9
 """Friction loss that makes MuJoCo reserve the constraint's row."""
-YIELDS = 0.01
+YIELDS = 0.002
 """How far an end of a play gives way under the joint's torque, relative to the play: what is hidden
 is the play, which a law with rigid ends would see larger by twice that."""
 
@@ -262,6 +262,11 @@ class Geared(AtDrivenJoint):
         raise NotImplementedError
 
 
+def _link_inertia(scene: Scene, dof: int) -> float:
+    """Return the inertia that the coupling at a joint turns, without its rotor's."""
+    return max(scene.inertia[dof] - scene.model.dof_armature[dof], 1e-4)
+
+
 class Backlash(Geared):
     kind = "backlash"
 
@@ -272,7 +277,9 @@ class Backlash(Geared):
     def coupling(self, scene):
         dof = scene.dof(self.name)
         stiffness = scene.torque[dof] / (YIELDS * self["gap"])
-        return stiffness, np.sqrt(stiffness * scene.model.dof_armature[dof]), self["gap"] / 2
+        rotor, link = scene.model.dof_armature[dof], _link_inertia(scene, dof)
+        damping = np.sqrt(stiffness * rotor * link / (rotor + link))
+        return stiffness, damping, self["gap"] / 2
 
 
 class JointFlexibility(Geared):
@@ -282,11 +289,8 @@ class JointFlexibility(Geared):
     def draw(cls, scene, name, size, rng):
         dof = scene.dof(name)
         stiffness = scene.torque[dof] / jitter(0.03 * size, rng)
-        own = max(scene.inertia[dof] - scene.model.dof_armature[dof], 1e-4)
-        return {
-            "stiffness": stiffness,
-            "damping": rng.uniform(0.1, 0.3) * np.sqrt(stiffness * own),
-        }
+        damping = rng.uniform(0.1, 0.3) * np.sqrt(stiffness * _link_inertia(scene, dof))
+        return {"stiffness": stiffness, "damping": damping}
 
     def coupling(self, scene):
         return self["stiffness"], self["damping"], 0.0

@@ -10,6 +10,8 @@ from garat_jax.diagnosis.hidden import delayed, finer_timestep, simulate
 from .robots import Scene, excite
 from .secrets import Secret
 
+LEAD = 0.5
+"""Steps by which positions are ahead of their time: their step takes the velocities at its end."""
 WINDOW = 0.5
 """Seconds over which the model without the secret is let run to see whether the secret shows."""
 
@@ -39,15 +41,32 @@ def measure(
     fine = delayed(np.repeat(ctrl, substeps, axis=0), round(delay / step))
     for secret in secrets:
         fine = secret.command(model, fine)
-    late = round(sum(secret.late() for secret in secrets) / step)
-    samples = np.maximum(np.arange(len(time)) * substeps - late, 0)
-    states = simulate(model, data, fine, samples, _combine(secrets, model, scene))
+    at = np.arange(len(time)) * substeps - sum(secret.late() for secret in secrets) / step
+    qpos, qvel = _sense(model, data, fine, np.maximum(at, 0.0), _combine(secrets, model, scene))
     joints = [scene.model.joint(i).name for i in range(scene.model.njnt)]
-    qpos = states[:, [int(model.joint(n).qposadr[0]) for n in joints]]
-    qvel = states[:, [model.nq + int(model.joint(n).dofadr[0]) for n in joints]]
+    qpos = qpos[:, [int(model.joint(n).qposadr[0]) for n in joints]]
+    qvel = qvel[:, [int(model.joint(n).dofadr[0]) for n in joints]]
     for secret in secrets:
         secret.sense(joints, qpos, qvel)
     return np.concatenate([qpos, qvel], axis=1)
+
+
+def _sense(model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray, at: np.ndarray, act):
+    """Simulate, and return positions [T, nq] and velocities [T, nv] at times `at`, in steps, [T].
+
+    Between steps they are interpolated linearly, positions at the staggered times of the leapfrog
+    method, which a semi-implicit step is.
+    """
+    first = np.floor(at - LEAD)
+    steps = first[:, None] + np.arange(3)
+    needed, place = np.unique(np.maximum(steps, 0).astype(int), return_inverse=True)
+    states = simulate(model, data, ctrl, needed, act)[place.reshape(steps.shape)]
+    parts = np.split(states, [model.nq], axis=2)
+    weights = (1.0 - np.abs(at[:, None] - lead - steps) for lead in (LEAD, 0.0))
+    return [
+        np.einsum("tj,tji->ti", np.maximum(weight, 0.0), part)
+        for weight, part in zip(weights, parts, strict=True)
+    ]
 
 
 def _combine(secrets: Sequence[Secret], model: mujoco.MjModel, scene: Scene):

@@ -180,7 +180,9 @@ class ActuatorDelay(Late):
 
     def command(self, model, ctrl):
         ctrl, at = ctrl.copy(), columns(model, self.target)
-        ctrl[:, at] = delayed(ctrl[:, at], round(self["delay"] / model.opt.timestep))
+        whole, part = divmod(self["delay"] / model.opt.timestep, 1.0)
+        sooner, later = (delayed(ctrl[:, at], int(whole) + more) for more in (0, 1))
+        ctrl[:, at] = (1.0 - part) * sooner + part * later
         return ctrl
 
 
@@ -194,8 +196,10 @@ class ActuatorLag(Late):
     def command(self, model, ctrl):
         ctrl, at = ctrl.copy(), columns(model, self.target)
         keep = np.exp(-model.opt.timestep / self["time_constant"])
-        rest = keep * ctrl[0, at]
-        ctrl[:, at] = signal.lfilter([1 - keep], [1, -keep], ctrl[:, at], axis=0, zi=rest[None])[0]
+        after = signal.lfilter([1 - keep], [1, -keep], ctrl[:, at], axis=0, zi=keep * ctrl[:1, at])[
+            0
+        ]
+        ctrl[:, at] = (after + delayed(after, 1)) / 2.0  # the mean of each step
         return ctrl
 
 

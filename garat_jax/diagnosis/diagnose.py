@@ -137,7 +137,9 @@ def diagnose_keeping(
     return found, simulator
 
 
-def split(recordings: Sequence[Recording], holdout: Sequence[Recording]):
+def split(
+    recordings: Sequence[Recording], holdout: Sequence[Recording]
+) -> tuple[Sequence[Recording], Sequence[Recording], str]:
     """Return the recordings to fit, those to hold out, and a phrase that says how."""
     if holdout:
         return tuple(recordings), tuple(holdout), "on the recordings given to hold out"

@@ -100,7 +100,7 @@ class _Parameter(NamedTuple):
 
 def _alone(
     model: Model,
-    parts,
+    parts: tuple[Sequence[Recording], Sequence[Recording], str],
     selected: Sequence[Candidate],
     candidates: Sequence[Candidate],
     say: Callable[[str], None],

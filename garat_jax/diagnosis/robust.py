@@ -1,4 +1,4 @@
-"""Least squares whose uncertainty holds where errors are correlated within blocks of time."""
+"""Least squares whose uncertainty holds where errors last, within blocks of time and beyond."""
 
 from typing import NamedTuple
 
@@ -39,14 +39,7 @@ def regress(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray) -> Re
         residual: [M].
         labels: The block of each residual, integers, [M].
     """
-    basis, back = _directions(columns)
-    along = basis.T @ residual
-    rest = residual - basis @ along
-    num_blocks = len(np.unique(labels))
-    freedom = max(num_blocks - columns.shape[1], 1)
-    scores = _by_block(basis * rest[:, None], labels) @ back.T
-    covariance = scores.T @ scores * (num_blocks / freedom)
-    return Regression(-back @ along, covariance, rest, freedom)
+    return _regress(*_directions(columns), residual, labels)[0]
 
 
 def jackknife(
@@ -67,8 +60,8 @@ def jackknife(
         stretches: The stretch in which the block with each label lies, by label: blocks of one
             follow each other.
     """
-    found, (basis, back) = regress(columns, residual, labels), _directions(columns)
-    scores = _by_block(basis * found.rest[:, None], labels)
+    basis, back = _directions(columns)
+    found, scores = _regress(basis, back, residual, labels)
     size = basis.shape[1]
     own = [_by_block(basis * direction[:, None], labels) for direction in basis.T]
     own = np.reshape(own, (size, len(scores), size)).swapaxes(0, 1)
@@ -78,6 +71,27 @@ def jackknife(
     covariance = change.T @ change * (1.0 - 1.0 / len(np.unique(labels)))
     wider = _lasting(change, stretches[: len(change)], len(np.unique(labels)))
     return found._replace(covariance=covariance * np.outer(wider, wider))
+
+
+def _regress(
+    basis: np.ndarray, back: np.ndarray, residual: np.ndarray, labels: np.ndarray
+) -> tuple[Regression, np.ndarray]:
+    """Regress on orthonormal directions; return its sums over blocks, [labels, r], too.
+
+    Args:
+        basis: The directions, [M, r].
+        back: Their part in coefficients, [k, r].
+        residual: [M].
+        labels: As for `regress`.
+    """
+    along = basis.T @ residual
+    rest = residual - basis @ along
+    num_blocks = len(np.unique(labels))
+    freedom = max(num_blocks - len(back), 1)
+    scores = _by_block(basis * rest[:, None], labels)
+    of_each = scores @ back.T
+    covariance = of_each.T @ of_each * (num_blocks / freedom)
+    return Regression(-back @ along, covariance, rest, freedom), scores
 
 
 def _directions(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
