@@ -123,7 +123,7 @@ def view(dynamics: Dynamics) -> ModelView:
         owner, _, field = name.rpartition(".")
         return jnp.asarray(getattr(getattr(root, owner) if owner else root, field))
 
-    model = ModelView(dynamics.host.model, read)
+    model = ModelView(dynamics.host.model, read, engine=dynamics.engine)
     for effect in dynamics.effects:
         model = model.replace(effect.fields(model))
     return model
@@ -338,7 +338,7 @@ def apply_effects(dynamics: Dynamics, model: ModelView, state, ctrl, memories):
     updated = []
     for effect, memory in zip(dynamics.effects, memories, strict=True):
         if effect.tunes:
-            model = model.replace(effect.tune(model, state, ctrl))
+            model = model.replace(effect.tune(model, state._replace(memory=memory), ctrl))
         ctrl, added, memory = effect.apply(model, state, ctrl, memory)
         force = force if added is None else force + added
         updated.append(memory)

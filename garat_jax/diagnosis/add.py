@@ -241,8 +241,10 @@ def estimates(problem: Problem, fitted: Fit) -> dict[str, Estimate]:
 def _starts(problem: Problem, before: Fit, effect: Effect, given) -> list[np.ndarray]:
     """List the parameters from which a fit should be tried, each [num_parameters]."""
     simulator = problem.simulator
+    known = {name: float(getattr(effect, name)) for name in given}
     thetas = [before.theta.copy() for _ in problem.starts(0)]
-    for theta, sizes in zip(thetas, problem.starts(0), strict=True):
+    for theta, start in zip(thetas, problem.starts(0), strict=True):
+        sizes = effect.beside(start, known)
         for j, slot in enumerate(simulator.slots):
             if slot.parameter.name in sizes and slot.parameter.name not in given:
                 theta[j] = sizes[slot.parameter.name]

@@ -93,7 +93,11 @@ def read_bag(path: Path, sources: Sequence[str], clock: str) -> dict[str, Series
 def _rows(
     reader: Any, wanted: Mapping[str, Source], clock: str
 ) -> dict[str, list[tuple[float, float]]]:
-    """Return seconds and value of each message of an open bag, by the names of `wanted`."""
+    """Return seconds and value of each message of an open bag, by the names of `wanted`.
+
+    Messages that do not hold an element by its name are passed over: an arm and its gripper may
+    tell their joints' states on one topic.
+    """
     topics = reader.topics
     for source in wanted.values():
         if source.topic not in topics:
@@ -101,14 +105,29 @@ def _rows(
     chosen = {source.topic for source in wanted.values()}
     connections = [c for c in reader.connections if c.topic in chosen]
     found: dict[str, list[tuple[float, float]]] = {text: [] for text in wanted}
+    others: dict[str, set[str]] = {}
     for connection, stamp, raw in reader.messages(connections):
         message = _message(reader, raw, connection)
         stamp = (_header_stamp(message) if clock == "header" else 0) or stamp
         time = 1e-9 * (stamp - reader.start_time)
         for text, source in wanted.items():
             if source.topic == connection.topic:
-                found[text].append((time, _value(message, source)))
+                try:
+                    found[text].append((time, _value(message, source)))
+                except _NotInMessageError as error:
+                    others.setdefault(text, set()).update(error.names)
+    for text, source in wanted.items():
+        if text in others and not found[text]:
+            raise unknown_name(f"name in {source.topic}", str(source.element), sorted(others[text]))
     return found
+
+
+class _NotInMessageError(Exception):
+    """A message does not name the element that is wanted; `names` are those that it has."""
+
+    def __init__(self, names: set[str]):
+        super().__init__(names)
+        self.names = names
 
 
 def _message(reader: Any, raw: bytes, connection: Any) -> Any:
@@ -172,7 +191,7 @@ def _element(values: Any, owner: Any, source: Source) -> Any:
     elif element.isdigit():
         index = int(element)
     else:
-        raise unknown_name(f"name in {source.topic}", element, names)
+        raise _NotInMessageError(set(names))
     if index >= len(values):
         raise UserError(
             f"{source.topic}.{source.field} has {len(values)} elements, so it has no [{element}]"

@@ -23,9 +23,15 @@ def with_continuous_quaternions(model: mujoco.MjModel, qpos: np.ndarray) -> np.n
     qpos = qpos.copy()
     for start in quaternions(model):
         there = slice(start, start + 4)
-        flips = np.sum(qpos[1:, there] * qpos[:-1, there], axis=1) < 0
-        qpos[1:, there] *= np.cumprod(np.where(flips, -1.0, 1.0))[:, None]
+        qpos[:, there] = with_one_sign(qpos[:, there])
     return qpos
+
+
+def with_one_sign(quaternion: np.ndarray) -> np.ndarray:
+    """Return a quaternion over time, [T, 4], with its sign as in the sample before."""
+    flips = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
+    signs = np.cumprod(np.where(flips, -1.0, 1.0))
+    return quaternion * np.concatenate([[1.0], signs])[:, None]
 
 
 def wrapped_joints(

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.io.matlab import mat_struct
 
 from garat_jax.diagnosis.bags import Series, is_bag, read_bag
+from garat_jax.diagnosis.continuous import JUMP, TURN, with_one_sign
 from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.maps import ColumnMap, read_map
 from garat_jax.diagnosis.tables import (
@@ -81,19 +82,50 @@ def _from_bag(log: Path, column_map: ColumnMap) -> dict[str, np.ndarray]:
     kept = np.concatenate([[True], np.diff(stamps) > 0]) & covered
     if not kept.any():
         raise UserError(f"{log}: the topics in {column_map.path} do not overlap in time")
-    columns = {"time": time[kept]}
-    for name, source in sources.items():
-        if name != "time":
-            values = _at(series[source], stamps[kept], held=name.startswith("ctrl."))
-            columns[name] = column_map.columns[name].to_si(values)
-    return columns
+    measured = {
+        name: Series(series[source].time, column_map.columns[name].to_si(series[source].values))
+        for name, source in sources.items()
+        if name != "time"
+    }
+    _make_quaternions_continuous(measured)
+    return {"time": time[kept]} | {
+        name: _at(one, stamps[kept], name.partition(".")[0]) for name, one in measured.items()
+    }
 
 
-def _at(series: Series, stamps: np.ndarray, held: bool) -> np.ndarray:
-    """Return a series at other times: the last value where it is held, else interpolated."""
-    if held:
-        return series.values[np.searchsorted(series.time, stamps, side="right") - 1]
-    return np.interp(stamps, series.time, series.values)
+def _at(series: Series, stamps: np.ndarray, kind: str) -> np.ndarray:
+    """Return a series at other times: the last value of a command, else interpolated.
+
+    Where an angle begins anew after a turn, the nearest value: none lies between.
+    """
+    after = np.searchsorted(series.time, stamps, side="right")
+    if kind == "ctrl":
+        return series.values[after - 1]
+    between = np.interp(stamps, series.time, series.values)
+    if kind != "qpos":
+        return between
+    after = np.minimum(after, len(series.time) - 1)
+    before = np.maximum(after - 1, 0)
+    is_near = stamps - series.time[before] < series.time[after] - stamps
+    nearest = np.where(is_near, series.values[before], series.values[after])
+    jumps = np.abs(series.values[after] - series.values[before]) > JUMP * TURN
+    return np.where(jumps, nearest, between)
+
+
+def _make_quaternions_continuous(measured: dict[str, Series]) -> None:
+    """Give the parts of each quaternion that are logged together one sign throughout."""
+    parts: dict[str, list[str]] = {}
+    for name in measured:
+        joint, _, number = name.rpartition(".")
+        if joint.startswith("qpos.") and number.isdecimal():
+            parts.setdefault(joint, []).append(name)
+    for names in parts.values():
+        names = sorted(names, key=lambda name: int(name.rpartition(".")[2]))[-4:]
+        times = [measured[name].time for name in names]
+        if len(names) == 4 and all(np.array_equal(time, times[0]) for time in times):
+            values = with_one_sign(np.stack([measured[name].values for name in names], axis=1))
+            for name, time, column in zip(names, times, values.T, strict=True):
+                measured[name] = Series(time, column)
 
 
 def _mat(log: Path) -> dict[str, np.ndarray]:

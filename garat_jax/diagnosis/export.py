@@ -11,7 +11,7 @@ import numpy as np
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.effects import Effect, in_order
 from garat_jax.effects.joint import TorqueOffset
-from garat_jax.effects.transmission import Transmission
+from garat_jax.effects.motor_apart import Transmission
 from garat_jax.errors import UserError
 
 
@@ -47,7 +47,7 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
     spec = model.spec.copy()
     for override in model.overrides:
         override.apply(spec)
-    _write_out_springs(spec)
+    _write_out(spec)
     unsaid = tuple(
         line if effect.kind in line else f"{effect.kind} at {effect.target}: {line}"
         for effect in sorted(in_order(model.effects), key=_turn)
@@ -71,14 +71,19 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
     return Exported(path, unsaid)
 
 
-def _write_out_springs(spec: mujoco.MjSpec) -> None:
-    """Write stiffness and damping in place of a springdamper, which would overwrite both."""
+def _write_out(spec: mujoco.MjSpec) -> None:
+    """Write what the compiler makes of a springdamper and a dampratio in their place.
+
+    They would overwrite an effect's stiffness and damping, or follow an effect's masses.
+    """
     host = spec.copy().compile()
     for joint in spec.joints:
         if joint.name and np.any(joint.springdamper):
             compiled = host.joint(joint.name)
             joint.stiffness[0], joint.damping[0] = compiled.stiffness[0], compiled.damping[0]
             joint.springdamper = [0.0, 0.0]
+    for actuator, bias in zip(spec.actuators, host.actuator_biasprm, strict=True):
+        actuator.biasprm[:] = bias
 
 
 def _turn(effect: Effect) -> int:

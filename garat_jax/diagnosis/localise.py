@@ -4,6 +4,7 @@ The missing torque is inverse dynamics of the measured motion minus the torque t
 actuators give, both smoothed by the same filter. It is a second view, independent of the fit.
 """
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ from garat_jax.dynamics import Dynamics, apply_effects, initial_state, view
 from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
 from garat_jax.effects.gear import gear_of
 from garat_jax.effects.units import at_slide
+from garat_jax.engine import HostModel
 
 if TYPE_CHECKING:
     from garat_jax.diagnosis.measurements import Recording
@@ -32,6 +34,8 @@ SLOW = 0.25
 """Speed below which a joint counts as slow, relative to its root mean square."""
 MUCH = 0.5
 """Part of the largest commanded torque from which commands count as large."""
+ALIKE = 0.01
+"""Difference of two timesteps, relative to one, that does not count."""
 BY_CONTACTS = "in proportion to the contacts"
 """The regime of what the contacts give."""
 WORTH_TELLING = 0.05
@@ -199,11 +203,19 @@ def _activations(model: mujoco.MjModel, recording: "Recording") -> np.ndarray:
 
 def _of_effects(world: Dynamics | None, time: np.ndarray, qpos, qvel, ctrl):
     """Return commands [T, nu] as effects leave them, and their forces [T, nv], at even times."""
-    if world is None or not any(effect.acts for effect in world.effects):
+    if world is None:
         return ctrl, np.zeros_like(qvel)
-    substeps = max(1, round(float(np.median(np.diff(time))) / world.timestep))
+    effects = tuple(effect.along_path() for effect in world.effects)
+    if not any(effect.acts for effect in effects):
+        return ctrl, np.zeros_like(qvel)
+    interval = float(np.median(np.diff(time)))
+    substeps = max(1, int(np.ceil(interval / world.timestep - ALIKE)))
+    if abs(interval / substeps / world.timestep - 1.0) > ALIKE:
+        host = copy.copy(world.host.model)
+        host.opt.timestep = interval / substeps  # by which the effects' memories advance
+        world = dataclasses.replace(world, host=HostModel(host))
     inputs = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel, ctrl))
-    sent, force = _acting(world, *inputs, substeps)
+    sent, force = _acting(dataclasses.replace(world, effects=effects), *inputs, substeps)
     return np.asarray(sent, float), np.asarray(force, float)
 
 
@@ -253,7 +265,7 @@ def _of_span(
         data.qpos[:], data.qvel[:] = qpos[k], speed[k]
         data.qacc[:], data.ctrl[:], data.act[:] = acceleration[k], sent[k], act[k]
         mujoco.mj_inverse(model, data)
-        needed, load = data.qfrc_inverse - force[k], data.qfrc_bias.copy()
+        needed, load = data.qfrc_inverse.copy(), data.qfrc_bias.copy()
         contact = _contact_torque(model, data)
         mujoco.mj_fwdActuation(model, data)
         drive = data.actuator_force * gears
@@ -261,12 +273,13 @@ def _of_span(
         limited = at_limit & (model.actuator_forcelimited != 0)
         rows.append((needed, load, contact, data.qfrc_actuator.copy(), drive, limited))
     needed, load, contact, given, drive, limited = map(np.asarray, zip(*rows, strict=True))
-    both = signal.savgol_filter(np.hstack([given, drive]), size, 2, axis=0)
-    given, drive = both[:, : model.nv], both[:, model.nv :]
+    smoothed = signal.savgol_filter(np.hstack([given, force, drive]), size, 2, axis=0)
+    given, force, drive = np.split(np.asarray(smoothed), [model.nv, 2 * model.nv], axis=1)
+    missing = needed - force - given
     position = _positions(model, qpos)
     elapsed = (time - recording.time[0]) / (recording.time[-1] - recording.time[0])
     edge = slice(size // 2, len(time) - size // 2)
-    of_dofs = (time, elapsed, position, speed, acceleration, given, load, contact, needed - given)
+    of_dofs = (time, elapsed, position, speed, acceleration, given, load, contact, missing)
     columns = (*of_dofs, ctrl, drive, limited)
     return tuple(column[edge] for column in columns)
 

@@ -16,6 +16,7 @@ from garat_jax.diagnosis.columns import actuator_names, signals
 from garat_jax.diagnosis.localise import missing_torque
 from garat_jax.diagnosis.units import UNITS
 from garat_jax.diagnosis.velocity import estimate_velocity
+from garat_jax.effects.at_joint import clamps
 from garat_jax.effects.elements import DOFS_OF_JOINT
 
 if TYPE_CHECKING:
@@ -196,7 +197,7 @@ def _commands(recording: "Recording", model: mujoco.MjModel) -> list[str]:
         "have given no force there"
         for name in never_forgetting(model)
     ]
-    clamps = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+    is_clamped = clamps(model)
     for i, name in enumerate(actuator_names(model)):
         low, high = model.actuator_ctrlrange[i]
         command = recording.ctrl[:, i]
@@ -205,6 +206,7 @@ def _commands(recording: "Recording", model: mujoco.MjModel) -> list[str]:
             lines.append(
                 f"ctrl.{name} is beyond its range {low:g} to {high:g} in "
                 f"{int(beyond.sum())} of {len(command)} samples (from {command.min():.4g} to "
-                f"{command.max():.4g}); the model {'clamps it' if clamps else 'takes it as it is'}"
+                f"{command.max():.4g}); the model "
+                f"{'clamps it' if is_clamped[i] else 'takes it as it is'}"
             )
     return lines

@@ -108,7 +108,7 @@ def _done_by(dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Arr
     seen, memory = state if effect.reads_state else None, state.memory[0]
     tuned, sent, force = {}, ctrl[-1], None
     for command in ctrl:
-        tuned = effect.tune(model, seen, command)
+        tuned = effect.tune(model, state._replace(memory=memory), command)
         sent, force, memory = effect.apply(model.replace(tuned), seen, command, memory)
     memory = effect.note(host, state, dynamics.timestep, state.memory[0])
     sensed = effect.sense(host, state, memory)
@@ -136,7 +136,8 @@ def _check_shapes(dynamics: Dynamics) -> None:
     model, state = bare.replace(fields), _rest(dynamics)
     ctrl, memory = jnp.zeros(host.nu), effect.init(host)
     seen = state if effect.reads_state else None
-    _check_fields(effect, "tune", model, effect.tune(model, seen, ctrl))
+    tuned = effect.tune(model, state._replace(memory=memory), ctrl)
+    _check_fields(effect, "tune", model, tuned)
     returned = effect.apply(model, seen, ctrl, memory)
     if not isinstance(returned, tuple) or len(returned) != 3:
         what = "apply returns something else than (command, force or None, memory)"

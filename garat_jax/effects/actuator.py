@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from garat_jax.effects.at_joint import BIASES, GAINS
+from garat_jax.effects.at_joint import BIASES, GAINS, clamps
 from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
 from garat_jax.effects.elements import element_id
 from garat_jax.effects.gear import gear_in, gear_of
@@ -48,7 +48,7 @@ currents of 0, 10 .. 60 A.
 
 def clamped(host: mujoco.MjModel, ctrl: jax.Array) -> jax.Array:
     """Return the command [nu] within the actuators' ctrlrange, as the engine would take it."""
-    limited = host.actuator_ctrllimited.astype(bool)
+    limited = clamps(host)
     low = np.where(limited, host.actuator_ctrlrange[:, 0], -np.inf)
     high = np.where(limited, host.actuator_ctrlrange[:, 1], np.inf)
     return jnp.clip(ctrl, jnp.asarray(low, ctrl.dtype), jnp.asarray(high, ctrl.dtype))

@@ -1,5 +1,7 @@
 """What a torque at one joint feels, and what the actuators there give."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -41,6 +43,19 @@ def felt_inertia(model: ModelView, dof: int) -> jax.Array:
     return 1.0 / host.dof_invweight0[dof] + model["dof_armature"][dof] - host.dof_armature[dof]
 
 
+def drag(model: ModelView, dof: int, speed: jax.Array, slope: jax.Array) -> jax.Array:
+    """Return slope·speed [N m], no more than what stops the felt inertia in a substep, []."""
+    stopping = model.host.opt.timestep * slope / felt_inertia(model, dof)
+    return slope * speed / (1.0 + stopping)
+
+
+def clamps(host: mujoco.MjModel) -> np.ndarray:
+    """Say of which actuators the engine clamps the command to its range, [nu] bool."""
+    if host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+        return np.zeros(host.nu, bool)
+    return host.actuator_ctrllimited.astype(bool)
+
+
 def drivers(host: mujoco.MjModel, joint: int) -> list[int]:
     """List the actuators that act on a joint."""
     return [
@@ -64,7 +79,28 @@ def is_driven(host: mujoco.MjModel, name: str) -> bool:
 def actuator_torque(
     model: ModelView, joint: int, angle: jax.Array, speed: jax.Array, ctrl: jax.Array
 ) -> jax.Array:
-    """Return the torque [N m] of a joint's actuators as MuJoCo computes it, [].
+    """Return the torque [N m] of a joint's actuators as MuJoCo computes it, []; see `drive`."""
+    return drive(model, joint, angle, speed, ctrl).torque
+
+
+class Drive(NamedTuple):
+    """What a joint's actuators do there.
+
+    Attributes:
+        torque: What they give, N m.
+        per_angle: How much of it they take back per angle, N m/rad, those at their limit nothing.
+        per_speed: The same per speed, N m s/rad.
+    """
+
+    torque: jax.Array
+    per_angle: jax.Array
+    per_speed: jax.Array
+
+
+def drive(
+    model: ModelView, joint: int, angle: jax.Array, speed: jax.Array, ctrl: jax.Array
+) -> Drive:
+    """Compute a joint's actuators as MuJoCo does.
 
     Args:
         model: The model's gains, biases and limits.
@@ -74,11 +110,11 @@ def actuator_torque(
         ctrl: Command, [nu].
     """
     host = model.host
-    total = jnp.zeros((), ctrl.dtype)
+    total, pull = jnp.zeros((), ctrl.dtype), jnp.zeros(2, ctrl.dtype)
     for i in drivers(host, joint):
         gear = float(host.actuator_gear[i, 0])
         command = ctrl[i]
-        if host.actuator_ctrllimited[i]:
+        if clamps(host)[i]:
             command = jnp.clip(command, *(float(v) for v in host.actuator_ctrlrange[i]))
         length, velocity = gear * angle, gear * speed
         gain, bias = model["actuator_gainprm"][i], model["actuator_biasprm"][i]
@@ -87,23 +123,34 @@ def actuator_torque(
             force = force + (gain[1] * length + gain[2] * velocity) * command
         if host.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE:
             force = force + bias[0] + bias[1] * length + bias[2] * velocity
+        own = jnp.asarray(_pull(host, i), ctrl.dtype)
         if host.actuator_forcelimited[i]:
             low, high = model["actuator_forcerange"][i]
+            own = jnp.where((low < force) & (force < high), own, 0.0)
             force = jnp.clip(force, low, high)
-        total = total + gear * force
+        total, pull = total + gear * force, pull + own
     if host.jnt_actfrclimited[joint]:
-        total = jnp.clip(total, *(float(v) for v in host.jnt_actfrcrange[joint]))
-    return total.astype(ctrl.dtype)
+        low, high = (float(v) for v in host.jnt_actfrcrange[joint])
+        pull = jnp.where((low < total) & (total < high), pull, 0.0)
+        total = jnp.clip(total, low, high)
+    return Drive(total.astype(ctrl.dtype), *jnp.maximum(pull, 0.0))
 
 
 def feedback(host: mujoco.MjModel, joint: int) -> tuple[float, float]:
     """Return how much a joint's servos pull back per angle and per speed, N m/rad, N m s/rad."""
-    found = drivers(host, joint)
-    bias = np.where(
-        host.actuator_biastype[found][:, None] == mujoco.mjtBias.mjBIAS_AFFINE,
-        host.actuator_biasprm[found],
-        0.0,
-    )
-    pull = -bias[:, 1:3] * host.actuator_gear[found][:, :1] ** 2
-    per_angle, per_speed = np.maximum(pull.sum(axis=0), 0.0)
+    pull = sum((_pull(host, i) for i in drivers(host, joint)), np.zeros(2))
+    per_angle, per_speed = np.maximum(pull, 0.0)
     return float(per_angle), float(per_speed)
+
+
+def has_limit(host: mujoco.MjModel, joint: int) -> bool:
+    """Say whether the force of a joint's actuators has limits."""
+    limited = host.actuator_forcelimited[drivers(host, joint)]
+    return bool(np.any(limited) or host.jnt_actfrclimited[joint])
+
+
+def _pull(host: mujoco.MjModel, actuator: int) -> np.ndarray:
+    """Return how much an actuator pulls back per angle and per speed of its joint, [2]."""
+    if host.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE:
+        return np.zeros(2)
+    return -host.actuator_biasprm[actuator, 1:3] * host.actuator_gear[actuator, 0] ** 2

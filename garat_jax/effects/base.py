@@ -64,6 +64,7 @@ class ModelView:
     Attributes:
         host: The compiled MuJoCo model: sizes, names, addresses.
         changed: Fields that effects replaced, by MuJoCo's name (`opt.` for options).
+        engine: What steps the model, `mjx` or `mujoco`.
     """
 
     def __init__(
@@ -71,8 +72,9 @@ class ModelView:
         host: mujoco.MjModel,
         read: Callable[[str], jax.Array],
         changed: Mapping[str, jax.Array] | None = None,
+        engine: str = "mujoco",
     ):
-        self.host = host
+        self.host, self.engine = host, engine
         self.changed = dict(changed or {})
         self._read = read
 
@@ -81,7 +83,7 @@ class ModelView:
 
     def replace(self, changed: Mapping[str, jax.Array]) -> "ModelView":
         """Return a view in which the given fields have new values."""
-        return ModelView(self.host, self._read, {**self.changed, **changed})
+        return ModelView(self.host, self._read, {**self.changed, **changed}, self.engine)
 
     def dofs(self, joint: str) -> np.ndarray:
         """Return the dof indices of a joint by its name."""
@@ -223,6 +225,11 @@ class Effect(abc.ABC):
         return ({first.name: cls.at(host, target)[first.name] + first.scale},)
 
     @classmethod
+    def beside(cls, start: Mapping[str, float], given: Mapping[str, float]) -> Mapping[str, float]:
+        """Return one of `starts`, adapted to parameters that a user gives."""
+        return {**start, **given}
+
+    @classmethod
     def suggested(
         cls, position: np.ndarray, torque: np.ndarray, rests: np.ndarray
     ) -> Suggestion | None:
@@ -321,7 +328,7 @@ class Effect(abc.ABC):
 
         Args:
             model: The model as all effects leave it, and those before this one in this substep.
-            state: The `PhysicsState`.
+            state: The `PhysicsState`; its memory is this effect's.
             ctrl: Command as the effects before this one leave it, [nu].
         """
         del model, state, ctrl

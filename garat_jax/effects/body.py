@@ -123,6 +123,7 @@ class PayloadMass(Effect):
     def export(self, spec: mujoco.MjSpec) -> str:
         """Add the payload as a body with an inertial of its own."""
         if float(self.mass) > 0:
+            write_inertials(spec)
             name = free_name(f"{self.name}_payload", spec.body)
             self._add_body(spec, name, [float(v) for v in _vector(self)], float(self.mass))
         return ""
@@ -248,16 +249,25 @@ def moves(host: mujoco.MjModel, body: str) -> bool:
     return bool(host.body(body).weldid[0] > 0)
 
 
-def write_inertials(spec: mujoco.MjSpec, name: str) -> None:
-    """Make a body's compiled inertial explicit; every body's, where geoms would overrule it."""
+def write_inertials(spec: mujoco.MjSpec, name: str = "") -> None:
+    """Make a body's compiled inertial explicit; every body's, where the compiler overrules masses.
+
+    What overrules them is lifted: inertials from geoms, a total mass, least masses and inertias.
+    """
+    rules = spec.compiler
+    if rules.fusestatic:
+        spec.compile()  # fuses the spec's bodies, too
+        rules.fusestatic = False
     copy = spec.copy()
     host = copy.compile()
     from_geoms = mujoco.mjtInertiaFromGeom
-    overruled = spec.compiler.inertiafromgeom == from_geoms.mjINERTIAFROMGEOM_TRUE
-    spec.compiler.inertiafromgeom = from_geoms.mjINERTIAFROMGEOM_AUTO
+    is_overruled = rules.inertiafromgeom == from_geoms.mjINERTIAFROMGEOM_TRUE
+    is_overruled |= max(rules.settotalmass, rules.boundmass, rules.boundinertia) > 0
+    rules.inertiafromgeom = from_geoms.mjINERTIAFROMGEOM_AUTO
+    rules.settotalmass, rules.boundmass, rules.boundinertia = -1.0, 0.0, 0.0
     for body, copied in zip(spec.bodies, copy.bodies, strict=True):
         compiled = host.body(copied.id)
-        if compiled.mass[0] > 0 and (overruled or body.name == name):
+        if compiled.mass[0] > 0 and (is_overruled or body.name == name):
             body.explicitinertial = True
             body.mass, body.ipos = compiled.mass[0], compiled.ipos
             body.iquat, body.inertia = compiled.iquat, compiled.inertia

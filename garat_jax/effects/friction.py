@@ -18,7 +18,7 @@ from flax import struct
 from garat_jax.effects.at_joint import (
     actuator_torque,
     at_dof,
-    felt_inertia,
+    drag,
     is_driven,
     small_torque,
 )
@@ -27,18 +27,14 @@ from garat_jax.effects.elements import element_id
 
 SMALLEST_FRICTION = 1e-9
 """Friction loss [N m] that makes MuJoCo reserve a constraint row without being felt."""
+PEAK = 1.5
+"""Friction at rest, relative to that in motion, at which a peak is tried."""
 
 
 def reserve_row(spec: mujoco.MjSpec, joint: str) -> None:
     """Make the compiler reserve a joint's friction constraint."""
     element = spec.joint(joint)
     element.frictionloss = max(element.frictionloss, SMALLEST_FRICTION)
-
-
-def _drag(model: ModelView, dof: int, speed: jax.Array, slope: jax.Array) -> jax.Array:
-    """Return slope·speed [N m], no more than what stops the felt inertia in a substep, []."""
-    stopping = model.host.opt.timestep * slope / felt_inertia(model, dof)
-    return slope * speed / (1.0 + stopping)
 
 
 def _more_friction(model: ModelView, joint: str, torque: jax.Array) -> dict[str, jax.Array]:
@@ -245,7 +241,7 @@ class AsymmetricFriction(VaryingFriction):
         speed = state.qvel[dof]
         there = jnp.where(speed > 0, self.viscous_positive, self.viscous_negative)
         more = there - jnp.minimum(self.viscous_positive, self.viscous_negative)
-        torque = -_drag(model, dof, speed, more)
+        torque = -drag(model, dof, speed, more)
         return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
 
     def export(self, spec: mujoco.MjSpec) -> str:
@@ -301,10 +297,15 @@ class StribeckFriction(VaryingFriction):
         )
 
     @classmethod
+    def beside(cls, start: Mapping[str, float], given: Mapping[str, float]) -> Mapping[str, float]:
+        """Keep the peak above a friction in motion that is given: below, it is not felt."""
+        return {**start, "static": max(start["static"], PEAK * given.get("coulomb", 0.0)), **given}
+
+    @classmethod
     def refined_from(cls, simpler: Effect) -> Mapping[str, float]:
         """Begin with a peak of half the friction in motion."""
         size = float(getattr(simpler, simpler.parameters()[0].name))
-        return {"coulomb": size, "static": 1.5 * size, "velocity": 0.1}
+        return {"coulomb": size, "static": PEAK * size, "velocity": 0.1}
 
     def steady(self) -> jax.Array:
         """Return the Coulomb friction."""
@@ -390,7 +391,7 @@ class QuadraticDrag(Effect):
         """Add the drag at the present speed."""
         joint, dof = element_id(model.host, "joint", self.name), _dof(model.host, self.name)
         speed = state.qvel[dof]
-        torque = -_drag(model, dof, speed, self.coefficient * jnp.abs(speed))
+        torque = -drag(model, dof, speed, self.coefficient * jnp.abs(speed))
         return ctrl, at_dof(model.host, joint, torque, ctrl.dtype), memory
 
     def export(self, spec: mujoco.MjSpec) -> str:

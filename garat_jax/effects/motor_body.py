@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.effects.at_joint import drivers
+from garat_jax.effects.body import write_inertials
 from garat_jax.effects.elements import free_name
 
 NEGLIGIBLE = 1e-9
@@ -16,6 +17,7 @@ NEGLIGIBLE = 1e-9
 
 def add_motor(spec: mujoco.MjSpec, host: mujoco.MjModel, name: str, inertia: float) -> str:
     """Move a joint's motor, with its actuators and keyframes, to a body; return that one's name."""
+    write_inertials(spec)
     joint, motor = spec.joint(name), free_name(f"{name}_motor", spec.body, spec.joint)
     index = host.joint(name).id
     link = host.jnt_bodyid[index]

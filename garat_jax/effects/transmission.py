@@ -1,15 +1,7 @@
-"""Effects between a motor and its joint: a gear that bends, a gear with play.
+"""Effects between a motor and its joint: a gear that bends, a gear with play."""
 
-The motor is a body of its own, which the engine does not know. Its inertia is the joint's
-armature, which leaves the joint; its angle and speed relative to the joint are memory. The joint's
-actuators act on it, and servos see its angle and speed; the actuators' torque at the joint is
-taken away again. Friction, damping and limits stay at the joint, and so does the armature that
-`rotor_inertia` adds.
-"""
-
-import abc
 from collections.abc import Mapping
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +9,8 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from garat_jax.effects.at_joint import actuator_torque, at_dof, feedback, is_driven
-from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
-from garat_jax.effects.elements import element_id
-from garat_jax.effects.motor_body import add_gear, add_motor
+from garat_jax.effects.base import ModelView, Suggestion, parameter
+from garat_jax.effects.motor_apart import MotorSide, Transmission, link_inertia
 
 RIGID = 1e9
 """Stiffness [N m/rad] that stands for "does not bend"."""
@@ -34,199 +24,6 @@ SPRING_SHARE = 0.25
 """Part of the contact's impulse per speed that is its spring's; the rest is damping."""
 PARTS_OF_TRAVEL = (0.01, 0.1)
 """Parts of the way that a joint goes along the recordings at which play is tried."""
-NOWHERE = 1e9
-"""Joint angle [rad] before the first substep: one that no joint has."""
-STABLE = 4.0
-"""Bound of h²·ω² + 2·h·c, below which steps of h of a spring and damper are stable."""
-MARGIN = 0.5
-"""Part of the longest stable timestep that is safe: a link may be lighter than at its reference."""
-IMPLICIT = (
-    int(mujoco.mjtIntegrator.mjINT_IMPLICIT),
-    int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
-)
-
-
-class Motor(NamedTuple):
-    """The motor relative to its joint.
-
-    Attributes:
-        deflection: Motor angle minus joint angle at the start of the substep, rad.
-        slip: Motor speed minus joint speed at the start of the substep, rad/s.
-        own: What the motor's speed after the substep owes to the motor alone, rad/s.
-        apart: How much of the joint's speed after the substep it does not take on, 0 to 1.
-        angle: Joint angle at the start of the substep, rad.
-    """
-
-    deflection: jax.Array
-    slip: jax.Array
-    own: jax.Array
-    apart: jax.Array
-    angle: jax.Array
-
-
-class MotorSide(NamedTuple):
-    """The motor and its joint at the start of a substep.
-
-    Attributes:
-        joint: The joint's index.
-        inertia: Of the motor, at the joint, kg m².
-        stiffened: The same, with what the servo's feedback adds within a substep.
-        deflection: Motor angle minus joint angle, rad.
-        slip: Motor speed minus joint speed, rad/s.
-        speed: Of the joint, rad/s.
-        torque: On the motor, its servo's pull at the present speed left out, N m.
-    """
-
-    joint: int
-    inertia: float
-    stiffened: float
-    deflection: jax.Array
-    slip: jax.Array
-    speed: jax.Array
-    torque: jax.Array
-
-
-def link_inertia(host: mujoco.MjModel, dof: int) -> float:
-    """Return the inertia at a dof without the motor's, at the reference pose, kg m²."""
-    motor = float(host.dof_armature[dof])
-    return max(1.0 / float(host.dof_invweight0[dof]) - motor, 1e-3 * motor)
-
-
-@struct.dataclass
-class Transmission(Effect, abc.ABC):
-    """A motor that is not rigidly at its joint; one such effect at a joint."""
-
-    elements: ClassVar[tuple[str, ...]] = ("joint",)
-    needs: ClassVar[str] = (
-        "a joint with motors or servos without dynamics, an armature above 0 (the motor's "
-        "inertia), and an integrator other than RK4"
-    )
-    acts: ClassVar[bool] = True
-    reads_state: ClassVar[bool] = True
-
-    @classmethod
-    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
-        """Say whether the joint has a motor with inertia, and an integrator that is implicit."""
-        if not super().fits(host, element, name) or not is_driven(host, name):
-            return False
-        moving = host.dof_armature[host.joint(name).dofadr[0]] > 0
-        return bool(moving) and host.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
-
-    @property
-    @abc.abstractmethod
-    def active(self) -> jax.Array:
-        """Whether the motor is apart from its joint, []."""
-
-    @abc.abstractmethod
-    def couple(self, model: ModelView, side: MotorSide) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return the torque on the joint, and `own` and `apart` of the `Motor` after it."""
-
-    def inertia(self, host: mujoco.MjModel) -> float:
-        """Return the motor's inertia at the joint, kg m²."""
-        return float(host.dof_armature[host.joint(self.name).dofadr[0]])
-
-    def stiffened(self, host: mujoco.MjModel) -> float:
-        """Return the motor's inertia and what servo feedback adds in a substep, kg m²."""
-        step = host.opt.timestep
-        per_angle, per_speed = feedback(host, element_id(host, "joint", self.name))
-        return self.inertia(host) + step * (per_speed + step * per_angle)
-
-    def init(self, host: mujoco.MjModel) -> Motor:
-        """Return a motor at rest relative to its joint."""
-        del host
-        nothing = jnp.zeros(())
-        return Motor(nothing, nothing, nothing, nothing, jnp.full((), NOWHERE))
-
-    def fields(self, model: ModelView) -> dict[str, jax.Array]:
-        """Take the motor's inertia, and its servo's implicit damping, off the joint."""
-        host = model.host
-        dof = host.joint(self.name).dofadr[0]
-        gone = jnp.where(self.active, self.inertia(host), 0.0)
-        damping = self.implicit_damping(host)
-        if host.opt.integrator in IMPLICIT:
-            damping = damping - feedback(host, element_id(host, "joint", self.name))[1]
-        return {
-            "dof_armature": model["dof_armature"].at[dof].add(-gone),
-            "dof_damping": model["dof_damping"].at[dof].add(jnp.where(self.active, damping, 0.0)),
-        }
-
-    def implicit_damping(self, host: mujoco.MjModel) -> jax.Array:
-        """Return the damping [N m s/rad] at the joint that the engine takes implicitly, []."""
-        del host
-        return jnp.zeros(())
-
-    def apply(self, model: ModelView, state, ctrl: jax.Array, memory: Motor):
-        """Turn the motor, and couple it to the joint."""
-        host = model.host
-        joint = element_id(host, "joint", self.name)
-        angle, speed = state.qpos[host.jnt_qposadr[joint]], state.qvel[host.jnt_dofadr[joint]]
-        deflection, slip = _finish(memory, angle, speed, host.opt.timestep)
-        per_speed = feedback(host, joint)[1]
-        motor = actuator_torque(model, joint, angle + deflection, speed + slip, ctrl)
-        side = MotorSide(
-            joint=joint,
-            inertia=self.inertia(host),
-            stiffened=self.stiffened(host),
-            deflection=deflection,
-            slip=slip,
-            speed=speed,
-            torque=motor + per_speed * (speed + slip),
-        )
-        torque, own, apart = self.couple(model, side)
-        native = actuator_torque(model, joint, angle, speed, ctrl)
-        if host.opt.integrator in IMPLICIT:
-            native = native + per_speed * speed
-        torque = jnp.where(self.active, torque - native, 0.0)
-        after = Motor(deflection, slip, own, apart, angle)
-        kept = jax.tree.map(lambda new, old: new.astype(old.dtype), after, memory)
-        return ctrl, at_dof(host, joint, torque, ctrl.dtype), kept
-
-    @abc.abstractmethod
-    def tie(self, tendon: mujoco.MjsTendon, timestep: float) -> str:
-        """Let a tendon, whose length is motor less joint, act as the gear; say how in words."""
-
-    @abc.abstractmethod
-    def rates(self, host: mujoco.MjModel) -> tuple[float, float]:
-        """Return how fast the exported gear turns motor against link back, 1/s², and damps, 1/s."""
-
-    def export(self, spec: mujoco.MjSpec) -> str:
-        """Make the motor a body of its own, beside the link, and the gear a tendon between them.
-
-        The joint keeps its place, its friction, its limits and its sensors.
-        """
-        if not bool(self.active):
-            return ""
-        host = spec.copy().compile()
-        motor = add_motor(spec, host, self.name, self.inertia(host))
-        gear = add_gear(spec, self.name, motor)
-        how = self.tie(gear, spec.option.timestep)
-        said = (
-            f"{self.kind} at {self.target} as a force; instead {motor} is a body with the motor's "
-            f"inertia and actuators, and the tendon {gear.name} {how}"
-        )
-        per_angle, per_speed = (
-            rate + servo / self.inertia(host)
-            for rate, servo in zip(
-                self.rates(host), feedback(host, element_id(host, "joint", self.name)), strict=True
-            )
-        )
-        limit = STABLE / (per_speed + np.sqrt(per_speed**2 + STABLE * per_angle) + 1e-12)
-        if spec.option.timestep > (longest := MARGIN * limit):
-            said += f"; MuJoCo steps it explicitly, which needs a timestep below {longest:.2g} s"
-        return said
-
-
-def _finish(motor: Motor, angle: jax.Array, speed: jax.Array, step: float):
-    """Return deflection and slip after the last substep, whose joint speed is known by now.
-
-    Where the joint was put elsewhere meanwhile, the motor is put there with it.
-    """
-    epsilon = float(jnp.finfo(jnp.asarray(angle).dtype).eps)
-    moved = jnp.abs(angle - (motor.angle + step * speed))
-    went_on = moved <= 16.0 * epsilon * (1.0 + jnp.abs(angle))
-    slip = jnp.where(went_on, motor.own - motor.apart * speed, motor.slip)
-    deflection = motor.deflection + jnp.where(went_on, step * slip, 0.0)
-    return deflection, slip
 
 
 @struct.dataclass
@@ -299,10 +96,10 @@ class JointFlexibility(Transmission):
         x = step**2 * self.stiffness * (motor + link) / (motor * link)
         return step * self.stiffness * x / (x + 2.0) + self.damping
 
-    def implicit_damping(self, host: mujoco.MjModel) -> jax.Array:
+    def implicit_damping(self, host: mujoco.MjModel, stiffened) -> jax.Array:
         """Return what the gear's torque owes to the joint's speed after the substep, []."""
-        step, whole, slope = host.opt.timestep, self.stiffened(host), self.slope(host)
-        return slope * whole / (whole + step * slope)
+        step, slope = host.opt.timestep, self.slope(host)
+        return slope * stiffened / (stiffened + step * slope)
 
     def couple(self, model: ModelView, side: MotorSide) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Solve the motor with the gear at the end of the substep."""

@@ -60,6 +60,15 @@ def test_a_fitted_effect_is_recovered_and_said(pendulum, recorded, capsys):
     assert float(after) < 0.3 * float(before)
 
 
+def test_a_peak_above_a_friction_that_is_given_is_fitted(pendulum, recorded, capsys):
+    """Below the friction in motion it is not felt, and would seem not to be excited."""
+    made, files = recorded
+    coulomb = f"coulomb={made.parameters['torque']:.4g}"
+    arguments = ["stribeck_friction", "--at", "joint/hinge", "--set", coulomb, "--fit", *files]
+    assert add(pendulum, *arguments)[0] == 0
+    assert "static = " in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("after", "says_so"), [(0.1, False), (0.21, True)])
 def test_an_error_that_does_not_fall_is_said(after, says_so):
     sized = Sized(ViscousDamping("joint/hinge"), {}, 1.0, 0.2, after)

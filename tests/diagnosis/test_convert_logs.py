@@ -26,6 +26,7 @@ COLUMNS = """
 "qvel.hinge" = {{ from = "{speed}", unit = "deg/s" }}
 "ctrl.motor" = "{torque}"
 """
+AT_HINGE = '"qpos.hinge" = "/joint_states.position[hinge]"'
 OF_ARRAYS = COLUMNS.format(angle="state[0]", speed="state[1]", torque="u")
 OF_BAGS = COLUMNS.format(
     angle="/joint_states.position[hinge]", speed="/joint_states.velocity[1]", torque="/effort.data"
@@ -35,11 +36,15 @@ OF_BAGS = COLUMNS.format(
 def convert(
     folder, log, columns, time='time = "t"', head="", force=False
 ) -> tuple[int, Recording | None]:
+    status = convert_only(folder, log, f"{time}\n{columns}", head, force)
+    return status, Recording.read(folder / "data.csv", MODEL) if status == 0 else None
+
+
+def convert_only(folder, log, columns, head="", force=False) -> int:
     path, out = folder / "map.toml", folder / "data.csv"
-    path.write_text(f'format = "garat-map/1"\n{head}\n[column]\n{time}\n{columns}')
+    path.write_text(f'format = "garat-map/1"\n{head}\n[column]\n{columns}')
     given = ["convert", str(log), "--map", str(path), "--out", str(out), *["--force"] * force]
-    status = cli.main(given)
-    return status, Recording.read(out, MODEL) if status == 0 else None
+    return cli.main(given)
 
 
 def check(recording, torque=None):
@@ -120,8 +125,15 @@ def stamp(store, seconds):
     return cls(sec=EPOCH + nanoseconds // 1_000_000_000, nanosec=nanoseconds % 1_000_000_000)
 
 
-def messages(store):
-    """Yield (topic, message type, recorded nanoseconds, message): states recorded 13 ms late."""
+def hinge_beside_another(k):
+    return ["other", "hinge"], [0.0, ANGLE[k]]
+
+
+def messages(store, joints_at):
+    """Yield (topic, message type, recorded nanoseconds, message): states recorded 13 ms late.
+
+    `joints_at` returns names and positions of each sample.
+    """
     header, joints = store.types["std_msgs/msg/Header"], store.types["sensor_msgs/msg/JointState"]
     number = store.types["std_msgs/msg/Float64"]
     nothing = np.zeros(0)
@@ -129,17 +141,18 @@ def messages(store):
     for k in range(NUM):
         at = EPOCH * 10**9 + round(STAMPS[k] * 1e9)
         yield "/effort", number, at - 10**6, number(data=float(STAMPS[k]))
-        values = np.asarray([0.0, ANGLE[k]]), np.asarray([0.0, SPEED[k]])
+        names, position = joints_at(k)
         state = joints(
             header(stamp=stamp(store, STAMPS[k]), frame_id="", **extra),
-            ["other", "hinge"],
-            *values,
+            names,
+            np.asarray(position),
+            np.asarray([0.0, SPEED[k]]),
             nothing,
         )
         yield "/joint_states", joints, at + 13 * 10**6, state
 
 
-def write_bag(folder, kind):
+def write_bag(folder, kind, joints_at=hinge_beside_another):
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -153,7 +166,7 @@ def write_bag(folder, kind):
         writer, serialize = Writer(path, version=9, storage_plugin=plugin), store.serialize_cdr
     connections = {}
     with writer:
-        for topic, cls, at, message in messages(store):
+        for topic, cls, at, message in messages(store, joints_at):
             name = cls.__msgtype__
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, name, typestore=store)
@@ -169,6 +182,41 @@ def test_bags_of_ros_1_and_2(tmp_path, kind):
 def test_a_single_mcap_file(tmp_path):
     (file,) = write_bag(tmp_path, "mcap").glob("*.mcap")
     check(convert(tmp_path, file, OF_BAGS, time="")[1])
+
+
+def read_between(folder, joints_at, columns):
+    """Convert what lies at commands' stamps, 1 ms before those of the states."""
+    log = write_bag(folder, "mcap", joints_at)
+    columns = f'"ctrl.motor" = "/effort.data"\n{columns}'
+    assert convert_only(folder, log, columns, 'clock = "log"') == 0
+    return pd.read_csv(folder / "data.csv")
+
+
+def test_an_angle_that_begins_anew_is_not_interpolated_across_the_jump(tmp_path):
+    angle = (np.pi + 20.0 * STAMPS) % (2 * np.pi) - np.pi
+    made = read_between(tmp_path, lambda k: (["hinge"], [angle[k]]), AT_HINGE)
+    steps = np.diff(np.unwrap(made["qpos.hinge"]))
+    assert np.abs(np.diff(made["qpos.hinge"])).max() > 6.0
+    assert steps == pytest.approx(20.0 / RATE, rel=0.6)
+
+
+def test_a_quaternion_whose_sign_flips_stays_of_length_1(tmp_path):
+    turn = 3.0 * STAMPS
+    quaternion = np.stack([np.cos(turn), np.sin(turn), 0 * turn, 0 * turn], axis=1)
+    quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)  # a logger that keeps w ≥ 0
+    columns = "\n".join(f'"qpos.ball.{i}" = "/joint_states.position[{i}]"' for i in range(4))
+    made = read_between(tmp_path, lambda k: (["a", "b", "c", "d"], quaternion[k]), columns)
+    length = np.linalg.norm(made[[f"qpos.ball.{i}" for i in range(4)]], axis=1)
+    assert length == pytest.approx(np.ones(len(made)), abs=1e-3)
+
+
+def test_joints_that_share_a_topic_with_others_are_read(tmp_path):
+    def by_turns(k):
+        return (["hinge"], [ANGLE[k]]) if k % 2 else (["gripper", "finger"], [0.0, 0.0])
+
+    made = read_between(tmp_path, by_turns, AT_HINGE)
+    at = 0.014 + np.arange(len(made)) / RATE
+    assert made["qpos.hinge"].to_numpy() == pytest.approx(np.interp(at, STAMPS, ANGLE), abs=0.2)
 
 
 def test_the_clock_of_the_log_shifts_the_states_against_the_commands(tmp_path):

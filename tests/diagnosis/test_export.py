@@ -97,6 +97,52 @@ def test_a_motor_leaves_its_joint_before_other_effects_come(tmp_path):
     assert armature == pytest.approx({"elbow": 0.02, "elbow_motor": 0.01})
 
 
+ROD = """
+<mujoco>
+  <compiler {compiler}/>
+  <worldbody><body name="rod"><joint name="hinge" axis="0 1 0" armature="0.02"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1"/>
+    <body pos="0 0 -0.4"><geom size="0.03" mass="0.2"/></body></body></worldbody>
+  <actuator><position name="servo" joint="hinge" kp="20" dampratio="1"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+@pytest.mark.parametrize(
+    "compiler", ["", 'settotalmass="2"', 'boundinertia="0.005"', 'fusestatic="true"']
+)
+@pytest.mark.parametrize(
+    ("kind", "target", "sizes"),
+    [
+        ("payload_mass", "body/rod", {"mass": 1.0, "z": -0.4}),
+        ("com_offset", "body/rod", {"x": 0.05}),
+        ("rotor_inertia", "joint/hinge", {"inertia": 0.1}),
+        ("motor_gain", "actuator/servo", {"scale": 0.7}),
+        ("back_emf", "actuator/servo", {"coefficient": 0.9}),
+        ("joint_flexibility", "joint/hinge", {"stiffness": 40.0}),
+    ],
+)
+def test_what_the_compiler_derives_is_that_of_the_card(tmp_path, kind, target, sizes, compiler):
+    """Masses that it scales or bounds, and a servo's damping that follows from them."""
+    (tmp_path / "rod.xml").write_text(ROD.format(compiler=compiler))
+    model = load_model(tmp_path / "rod.xml")
+    effect = CATALOGUE[kind](target=target, **sizes)
+    card = load_model(save_card(tmp_path / "card.toml", model, [effect]))
+    plain = mujoco.MjModel.from_xml_path(str(export_mjcf(card, tmp_path / "out.xml").path))
+    host = dynamics.native_model(card.compile(engine="mujoco"))
+    if "bound" not in compiler:  # a payload's own body is bounded while the card is compiled
+        assert plain.actuator_biasprm[0] == pytest.approx(host.actuator_biasprm[0], rel=1e-4)
+    assert plain.body_mass.sum() == pytest.approx(host.body_mass.sum(), rel=1e-4)
+    weights = []
+    for each in (plain, host):
+        data = mujoco.MjData(each)
+        data.joint("hinge").qpos[0] = 0.5
+        mujoco.mj_forward(each, data)
+        weights.append(data.joint("hinge").qfrc_bias[0])
+    assert weights[0] == pytest.approx(weights[1], rel=1e-4)
+
+
 def push(folder, effects, mjcf=models.ARM):
     """Torque of the exported elbow's motor at rest, without a command, and what is left unsaid."""
     (folder / "model.xml").write_text(mjcf)

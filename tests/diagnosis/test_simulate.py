@@ -25,7 +25,7 @@ from garat_jax.effects import (
     ViscousDamping,
 )
 from garat_jax.effects.base import ModelView
-from garat_jax.effects.transmission import Transmission
+from garat_jax.effects.motor_apart import Transmission
 from garat_jax.errors import UserError
 from tests import models
 

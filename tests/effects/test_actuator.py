@@ -22,7 +22,7 @@ from garat_jax.effects import (
 )
 from garat_jax.effects.actuator import MINITAUR_CURVE
 from garat_jax.errors import UserError
-from tests.effects.truth import RIG, SERVO
+from tests.effects.truth import RIG, SERVO, commands, predict
 from tests.models import MUSCLE, PENDULUM, SLIDER, spec
 
 MOTOR = "actuator/motor"
@@ -256,3 +256,19 @@ def test_a_muscle_has_no_gain_in_proportion_to_its_numbers():
     with pytest.raises(UserError, match="fixed or affine, as no muscle's are"):
         MotorGain("actuator/biceps", scale=1.5).check(host)
     assert MotorGain.targets(spec(SERVO).compile()) == [MOTOR]
+
+
+@pytest.mark.parametrize("kind", ["motor_deadband", "motor_curve", "actuator_lag", "load_friction"])
+def test_commands_are_clamped_where_the_model_clamps_them_only(kind):
+    """A law at its nominal changes nothing, where commands go beyond their range, either."""
+    mjcf = RIG.replace('<option timestep="0.002"/>', NEVER_CLAMPS)
+    target = "joint/hinge" if kind == "load_friction" else "actuator/motor"
+    plain, same = (
+        predict(mjcf, effects, commands(9.0)) for effects in ((), (CATALOGUE[kind](target),))
+    )
+    np.testing.assert_allclose(same, plain, atol=1e-4)
+    clamped = predict(RIG, (), commands(9.0))
+    assert np.abs(clamped - plain).max() > 0.1
+
+
+NEVER_CLAMPS = '<option timestep="0.002"><flag clampctrl="disable"/></option>'

@@ -36,6 +36,9 @@ UNDAMPED = {
 HOST = spec(UNDAMPED["servo"]).compile()
 
 
+GEAR = 'stiffness="{}" damping="{}"'
+
+
 def play(gap: float) -> str:
     """Return the attributes of a joint that turns freely within a gap [rad] only."""
     return f'limited="true" range="{-gap / 2} {gap / 2}" solreflimit="0.0005 1"'
@@ -75,6 +78,30 @@ def test_backlash_is_two_bodies_with_play(drive, gap):
     error, without = compare(Backlash("joint/hinge", gap=gap), play(gap), drive)
     assert error < 3.5e-3
     assert without > 4 * error
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("limit", ["forcerange", "actuatorfrcrange"])
+@pytest.mark.parametrize(
+    ("effect", "gear"),
+    [
+        (JointFlexibility("joint/hinge", stiffness=50.0, damping=0.02), GEAR.format(50.0, 0.02)),
+        (Backlash("joint/hinge", gap=0.02), play(0.02)),
+    ],
+)
+def test_a_servo_at_the_limit_of_its_force_pulls_back_no_more(effect, gear, limit, integrator):
+    """It once took its damping along, which made the motor as heavy as with it: 0.1 rad off."""
+    servo = 'kp="20" kv="5" ctrlrange="-3 3"'
+    at_joint = 'actuatorfrcrange="-0.8 0.8"' * (limit == "actuatorfrcrange")
+    servo += ' forcerange="-0.8 0.8"' * (limit == "forcerange")
+    mjcf = UNDAMPED["servo"].replace('kp="20" kv="1" ctrlrange="-3 3"', servo)
+    mjcf = mjcf.replace('name="hinge"', f'name="hinge" {at_joint}')
+    mjcf = mjcf.replace("/>", f' integrator="{integrator}"/>', 1)
+    two = TWO_BODIES.format(gear=gear, actuator=f'<position joint="rotor" {servo}/>')
+    two = two.replace('name="rotor" axis', f'name="rotor" {at_joint} axis')
+    ctrl = commands(1.0)
+    error = (predict(mjcf, (effect,), ctrl) - record(two, Truth(), ctrl))[:, 0]
+    assert np.sqrt(np.mean(error**2)) < 5e-3
 
 
 @pytest.mark.parametrize("start", [start["gap"] for start in Backlash.starts(HOST, "joint/hinge")])
