@@ -123,6 +123,17 @@ def scale(
     }
 
 
+def counted(summary: Mapping[str, Any], values: Sequence[float]) -> np.ndarray:
+    """Return those of some values, [seeds], that count: of meaningful seeds, or all if none is."""
+    meaningful = np.asarray(summary["meaningful"], bool)
+    return np.asarray(values, float)[meaningful if meaningful.any() else slice(None)]
+
+
+def _error_ratio(summary: Mapping[str, Any]) -> float:
+    """Return the mean error of one step of the grounded source, as a share of the source's."""
+    return float(counted(summary, summary["error_ratio"]).mean())
+
+
 def write_report(run: RunDirectory, summary: Mapping[str, Any], difference: str) -> None:
     """Write `report.html` for a summary; `difference` says how target and source differ."""
     report.write(
@@ -139,7 +150,6 @@ def write_report(run: RunDirectory, summary: Mapping[str, Any], difference: str)
 def lead(summary: Mapping[str, Any]) -> str:
     """Say in two sentences what came out."""
     mean = summary["scaled"]["mean"]
-    ratio = np.mean(summary["error_ratio"])
     if mean is None:
         return (
             f"No seed is meaningful: {_left_out(summary)}. Nothing can be said about the method "
@@ -147,8 +157,9 @@ def lead(summary: Mapping[str, Any]) -> str:
         )
     return (
         f"After grounding, the policy reaches {mean:.2f} of the way from the source policy (0) to "
-        f"a policy trained in the target (1), and one step of the grounded source is off by "
-        f"{ratio:.2f} times what one step of the source is. {_beside_controls(summary)}"
+        "a policy trained in the target (1), and one step of the grounded source is off by "
+        f"{_error_ratio(summary):.2f} times what one step of the source is. "
+        f"{_beside_controls(summary)}"
     )
 
 
@@ -158,9 +169,8 @@ def _beside_controls(summary: Mapping[str, Any]) -> str:
     name = max(CONTROLS, key=lambda name: scaled[name]["mean"])
     beside = f"{CONTROLS[name].capitalize()}, the better of two controls, reaches"
     beside += f" {scaled[name]['mean']:.2f}"
-    kept = np.asarray(summary["meaningful"], bool)
-    lead = np.asarray(summary["scaled"]["per_seed"])[kept].astype(float)
-    lead -= np.asarray(scaled[name]["per_seed"])[kept].astype(float)
+    lead = counted(summary, summary["scaled"]["per_seed"])
+    lead -= counted(summary, scaled[name]["per_seed"])
     if len(lead) == 1:
         return f"{beside}; one seed cannot tell whether that is chance."
     half = stats.t.ppf(0.975, len(lead) - 1) * lead.std(ddof=1) / np.sqrt(len(lead))
@@ -179,7 +189,7 @@ def _left_out(summary: Mapping[str, Any]) -> str:
 def describe(summary: Mapping[str, Any]) -> str:
     """Return the result in a few lines for a terminal."""
     controls = summary["controls"]
-    baseline = np.mean(summary["baselines"]["zero_action"]["ratio"])
+    baseline = counted(summary, summary["baselines"]["zero_action"]["ratio"]).mean()
     has_spread = summary["scaled"]["standard_error"] is not None
     spread = ", mean ± standard error" if has_spread else ""
     lines = [
@@ -190,7 +200,7 @@ def describe(summary: Mapping[str, Any]) -> str:
             f"  {label:<22}{_with_error(controls[name]['scaled'])}"
             for name, label in CONTROLS.items()
         ),
-        f"Error of one step, share of the source's: {np.mean(summary['error_ratio']):.3f}; "
+        f"Error of one step, share of the source's: {_error_ratio(summary):.3f}; "
         f"with zero action {baseline:.3f}.",
     ]
     return "\n".join(lines)
@@ -207,7 +217,7 @@ def facts(summary: Mapping[str, Any]) -> list[Fact]:
         "action_noise": "control: action noise only",
     }
     shown = [Fact(_with_error(scaled[name]), label) for name, label in labels.items()]
-    return [*shown, Fact(f"{np.mean(summary['error_ratio']):.2f}", "error, share of the source's")]
+    return [*shown, Fact(f"{_error_ratio(summary):.2f}", "error, share of the source's")]
 
 
 def _with_error(scaled: Mapping[str, Any]) -> str:
@@ -241,8 +251,8 @@ def sections(summary: Mapping[str, Any], difference: str) -> list[Section]:
                     _error_figure(summary),
                     "Mean error of one step over the adversarial updates, one line a seed. Dashed: "
                     "the source as it is, and the source when every action is replaced by zero "
-                    "(means over seeds). A method below the zero line has learned more than to "
-                    "weaken the actions.",
+                    "(means over the meaningful seeds, or all if none is). A method below the zero "
+                    "line has learned more than to weaken the actions.",
                 )
             ],
         ),
@@ -320,7 +330,7 @@ def _error_figure(summary: Mapping[str, Any]) -> go.Figure:
         )
     labels = {"source": "source as it is", "zero_action": "zero action"}
     for colour, (name, label) in zip(report.COLOURS[1:], labels.items(), strict=False):
-        mean = float(np.mean(summary["transition_error"][name]))
+        mean = float(counted(summary, summary["transition_error"][name]).mean())
         figure.add_hline(
             y=mean,
             line={"color": colour, "dash": "dash"},

@@ -109,6 +109,18 @@ def test_one_meaningful_seed_has_no_standard_error():
     assert (result["scaled"]["mean"], result["scaled"]["standard_error"]) == (1.0, None)
 
 
+def test_the_errors_of_a_seed_that_is_not_meaningful_are_not_averaged_in():
+    result = summarise((100.0, 400.0, 100.0))  # ratios 0.1, 0.2, 0.25; zero action 0.5, 0.25, 0.25
+    assert "is off by 0.17 times" in summary.lead(result)
+    assert "share of the source's: 0.175; with zero action 0.375." in summary.describe(result)
+    assert summary.facts(result)[-1].value == "0.17"
+
+
+def test_where_no_seed_is_meaningful_the_errors_are_means_of_all():
+    result = summarise((900.0, 900.0, 900.0))
+    assert "share of the source's: 0.183; with zero action 0.333." in summary.describe(result)
+
+
 @pytest.fixture
 def run(tmp_path):
     return RunDirectory.create(tmp_path / "run", {"pair": "some_pair"}, "garat transfer x", SEEDS)

@@ -16,6 +16,8 @@ import speed_tables
 import tyro
 from results import ENGINES, ROOT, commits, origin, read, table
 
+from garat_jax.summary import counted
+
 BLOCK = re.compile(r"(<!-- table (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -58,13 +60,13 @@ def transfer() -> str:
         ("policy trained in the target", "1", mean(returns["target_policy"])),
     ]
     columns = ("trained in", "scaled return in the target", "return (of 1000)")
-    ratio, zero = row["error_ratio"], row["baselines"]["zero_action"]["ratio"]
-    counted = sum(row["meaningful"])
+    ratio = counted(row, row["error_ratio"])
+    zero = counted(row, row["baselines"]["zero_action"]["ratio"])
     text = (
-        f"\nMean ± standard error over {counted} meaningful of {len(row['seeds'])} seeds, 50 "
-        f"episodes each, {row['target_transitions']} target transitions. Error of one step, as a "
-        f"share of the source's: **{np.mean(ratio):.3f}** (worst seed {max(ratio):.3f}); with "
-        f"every action replaced by zero {np.mean(zero):.2f}.\n"
+        f"\nMean ± standard error over {sum(row['meaningful'])} meaningful of "
+        f"{len(row['seeds'])} seeds, 50 episodes each, {row['target_transitions']} target "
+        f"transitions. Error of one step, as a share of the source's: **{ratio.mean():.3f}** "
+        f"(worst seed {ratio.max():.3f}); with every action replaced by zero {zero.mean():.2f}.\n"
     )
     return table(columns, rows) + text + origin(name, result)
 

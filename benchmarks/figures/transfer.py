@@ -14,6 +14,7 @@ import numpy as np
 import tyro
 
 from garat_jax.report import COLOURS, INK, LINE, SOFT
+from garat_jax.summary import counted
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 WIDTH, HEIGHT = 900, 330
@@ -127,7 +128,7 @@ def errors(summary: dict[str, Any]) -> list[str]:
     levels = {
         "the source as it is": (1.0, COLOURS[1]),
         "actions replaced by zero": (
-            float(np.mean(summary["baselines"]["zero_action"]["ratio"])),
+            float(counted(summary, summary["baselines"]["zero_action"]["ratio"]).mean()),
             COLOURS[2],
         ),
     }
