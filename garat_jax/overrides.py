@@ -48,7 +48,7 @@ class Override:
         """Write the change into a spec.
 
         Raises:
-            UserError: There is no such element or field.
+            UserError: There is no such element or field, or it does not take the value.
         """
         target = self._find(spec)
         known = [name for name in dir(target) if _is_field(target, name)]
@@ -121,7 +121,13 @@ def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:
     """Scale a body's inertial and its geoms: the compiler decides which of them counts."""
     if mass <= 0:
         raise UserError(f"body/{body.name} mass must be positive, not {mass:g} kg")
-    ratio = mass / float(spec.copy().compile().body(body.name).mass[0])
+    before = float(spec.copy().compile().body(body.name).mass[0])
+    if not before:
+        raise UserError(
+            f"body/{body.name} has no mass to scale; name a body that moves, with an inertial or "
+            "with geoms that have mass"
+        )
+    ratio = mass / before
     body.mass = body.mass * ratio
     body.inertia = body.inertia * ratio
     body.fullinertia = body.fullinertia * ratio

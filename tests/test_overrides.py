@@ -72,6 +72,17 @@ def test_a_wrong_override_is_refused_in_one_line(override, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["mount", "world"])
+def test_what_has_no_mass_is_not_scaled(name):
+    """A mount carries the arm and has no geom of its own, and the world never moves."""
+    mounted = """
+    <mujoco><worldbody><geom size="0.1"/><body name="mount">
+      <body><joint/><geom size="0.1"/></body>
+    </body></worldbody></mujoco>"""
+    with pytest.raises(UserError, match=f"body/{name} has no mass to scale; name a body that"):
+        Override("body", name, "mass", 1.0).apply(spec(mounted))
+
+
 def test_what_a_springdamper_decides_is_not_overridden():
     sprung = PENDULUM.replace('name="hinge"', 'name="hinge" springdamper="0.5 1"')
     for field in ("damping", "stiffness"):
