@@ -91,7 +91,8 @@ class Trainer:
         """Step a batch of learners until they have done `num_iterations`.
 
         Metrics go to `metrics.jsonl`, one line an iteration. A checkpoint is written each minute,
-        at the end, and on an interrupt; a resumed run goes on from the newest.
+        at the end, and on an interrupt, with the time so far; a resumed run goes on from the
+        newest.
 
         Args:
             stage: Name of this part of the run.
@@ -122,11 +123,7 @@ class Trainer:
             self.run.rewind(first, stage)
         compiled, run = self._compile(_with_finite(step), (state, params), options)
         self.console.print(f"{stage}: memory {_memory(compiled)}")
-        started = time.monotonic()
-        try:
-            return self._loop(stage, run, state, params, first, num_iterations)
-        finally:
-            self._spent(started)
+        return self._loop(stage, run, state, params, first, num_iterations)
 
     def call(self, function: Callable, *arguments: Any, options: dict[str, Any] | None = None):
         """Compile a function, call it once, and return its result when it is there."""
@@ -137,9 +134,12 @@ class Trainer:
         self._spent(started)
         return result
 
-    def _spent(self, started: float) -> None:
-        self.seconds.run += time.monotonic() - started
+    def _spent(self, started: float) -> float:
+        """Count the time since `started`, write it down, and return when that was."""
+        now = time.monotonic()
+        self.seconds.run += now - started
         self.run.write_json(SECONDS, self.seconds)
+        return now
 
     def _compile(self, function: Callable, arguments: tuple, options: dict[str, Any] | None):
         started = time.monotonic()
@@ -169,14 +169,17 @@ class Trainer:
                         reported = now
                         self._report(stage, iteration, num_iterations, metrics)
                     if now - saved > CHECKPOINT_SECONDS:
-                        saved = now
                         self._save(folder, *progress)
+                        saved = self._spent(saved)
                     is_finished = "finished" in metrics and bool(metrics["finished"].all())
                     is_over = is_finished or iteration >= num_iterations
         except KeyboardInterrupt:
             self._keep(stage, *progress, is_over)
             raise
-        self._keep(stage, *progress, is_over)
+        else:
+            self._keep(stage, *progress, is_over)
+        finally:
+            self._spent(saved)
         how = "solved by every seed" if is_finished else "done"
         self.console.print(f"{stage}: {how} after {progress[0]} iterations")
         return progress[1]

@@ -4,6 +4,7 @@ import dataclasses
 import os
 import shutil
 import signal
+import time
 
 import jax
 import jax.numpy as jnp
@@ -298,6 +299,27 @@ def test_the_time_of_a_resumed_run_counts_the_processes_before(tmp_path):
     second.train("more", step, start, 0.1, 3)
     assert second.seconds.run > first.seconds.run
     assert second.seconds.compile > first.seconds.compile
+
+
+class Copied(RunDirectory):
+    """A run of which a copy is made in the middle of a stage: what SIGKILL would leave."""
+
+    def log(self, step, **metrics):
+        super().log(step, **metrics)
+        if step == 3:
+            shutil.copytree(self.root, self.root.parent / "killed")
+
+
+def test_the_time_of_a_stage_that_was_killed_counts_up_to_its_checkpoint(tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "CHECKPOINT_SECONDS", 0.0)
+    step, start = learner()
+    began = time.monotonic()
+    whole = trainer(directory(tmp_path / "whole", Copied))
+    whole.train("walk", step, start, 0.1, 5)
+    took = time.monotonic() - began
+    killed = trainer(directory(tmp_path / "killed", resume=True)).seconds
+    assert killed.compile == whole.seconds.compile > 0
+    assert 0 < killed.run < whole.seconds.run < took - whole.seconds.compile  # and none twice
 
 
 def test_a_metric_that_is_not_finite_stops_the_run_too(tmp_path):
