@@ -13,6 +13,7 @@ from rich.console import Console
 
 from garat_jax import checkpoint, split
 from garat_jax.devices import peak_mebibytes
+from garat_jax.env import EnvState
 from garat_jax.errors import DivergedError, UserError
 from garat_jax.interrupt import deferred_interrupt
 from garat_jax.rollout import Fault
@@ -104,7 +105,8 @@ class Trainer:
             options: XLA's compiler options.
 
         Raises:
-            DivergedError: A state stopped being finite.
+            DivergedError: A learner stopped being finite, or its worlds left the finite numbers too
+                often.
             UserError: The stage is over, and its checkpoint is gone or damaged.
         """
         folder = self.run.path(f"checkpoints/{stage}")
@@ -282,20 +284,21 @@ def _done(stage: str) -> str:
 
 
 def _with_finite(step):
-    """Add to a step's results whether each seed's float leaves are all finite, [seeds].
+    """Add to a step's results whether each seed's learner is finite in all its floats, [seeds].
 
-    The record of a fault holds what was not finite, and is left out.
+    The record of a fault holds what was not finite, and is left out. So are environments: what of
+    theirs must be finite `Env.must_be_finite` says, and `guarded_step` sees to it.
     """
 
-    def is_fault(node) -> bool:
-        return isinstance(node, Fault)
+    def is_left_out(node) -> bool:
+        return isinstance(node, Fault | EnvState)
 
     def stepped(state, params):
         state, metrics = step(state, params)
         finite = [
             jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1)
-            for leaf in jax.tree.leaves((state, metrics), is_leaf=is_fault)
-            if not is_fault(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
+            for leaf in jax.tree.leaves((state, metrics), is_leaf=is_left_out)
+            if not is_left_out(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
         ]
         return state, metrics, jnp.stack(finite).all(axis=0)
 

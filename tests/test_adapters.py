@@ -24,6 +24,8 @@ from garat_jax.methods.garat import GARAT, GARATConfig
 from garat_jax.methods.gat import GAT, GATConfig
 from garat_jax.methods.grounded import Grounding
 from garat_jax.methods.transition_error import transition_error
+from garat_jax.runs import RunDirectory
+from garat_jax.train import Trainer
 from tests.probe_envs import Bursting, Probe, WalkParams
 
 OLD_BRAX = pytest.mark.filterwarnings("ignore:Accessing .* directly from `Data` is deprecated")
@@ -260,6 +262,17 @@ def test_a_brax_environment_that_fails_ends_its_episode_and_nothing_else_does():
         np.testing.assert_array_equal(transitions.faulty, bursts & failed[..., 0])
         assert transitions.terminated[transitions.faulty].all()
         assert np.isfinite(transitions.next_obs).all()
+
+
+def test_what_a_brax_environment_keeps_may_be_infinite_in_training_too(tmp_path):
+    env = from_brax(BraxWalk(), episode_length=20)
+    agent = ppo.make(env, ppo.PPOConfig(num_envs=4, num_steps=8, hidden=(8,)))
+    start = jax.vmap(lambda key: agent.init(key, None))(jax.random.split(jax.random.key(0), 2))
+    step = jax.vmap(lambda state, params: agent.step(state, params)[:2], (0, None))
+    run = RunDirectory.create(tmp_path / "run", {}, "garat test", [0, 1])
+    state = Trainer(run, [0, 1]).train("walk", step, start, None, 2)
+    assert np.isinf(state.env.physics.info["nearest"]).all()
+    assert [line["faulty_share"] for line in run.metrics()] == [[0.0, 0.0]] * 2
 
 
 SMALL = {"num_envs": 8, "num_steps": 16, "hidden": (8,)}
