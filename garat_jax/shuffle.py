@@ -3,6 +3,8 @@
 import jax
 import jax.numpy as jnp
 
+from garat_jax.errors import UserError
+
 WORD = 32
 MOST = 1 << WORD // 2
 """Most numbers for which half of a word's bits are left to draw the order."""
@@ -12,12 +14,14 @@ def minibatch_size(total: int, num_minibatches: int) -> int:
     """Return how many of so many steps each minibatch has; a rest is left out.
 
     Raises:
-        ValueError: There are more minibatches than steps.
+        UserError: There are more minibatches than steps, or none.
     """
-    size = total // num_minibatches
-    if not size:
-        raise ValueError(f"a batch of {total} steps cannot make {num_minibatches} minibatches")
-    return size
+    if not 1 <= num_minibatches <= total:
+        raise UserError(
+            f"a batch of {total} steps cannot make {num_minibatches} minibatches; "
+            f"expected 1 to {total} of them, or a larger batch"
+        )
+    return total // num_minibatches
 
 
 def shuffled(key: jax.Array, num: int) -> jax.Array:

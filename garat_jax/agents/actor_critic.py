@@ -170,7 +170,7 @@ def minibatches(batch: Batch, key: jax.Array, num_minibatches: int) -> Batch:
     """Shuffle a batch [N] and cut it into [num_minibatches, N // num_minibatches].
 
     Raises:
-        ValueError: There are more minibatches than steps.
+        UserError: There are more minibatches than steps, or none.
     """
     total = batch.action.shape[0]
     size = minibatch_size(total, num_minibatches)

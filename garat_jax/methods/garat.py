@@ -30,7 +30,11 @@ from garat_jax.types import Metrics, Params, Policy, Transition
 
 @dataclasses.dataclass(frozen=True)
 class GARATConfig:
-    """Hyper-parameters; docs/grounding.md has the measurements behind the defaults."""
+    """Hyper-parameters; docs/grounding.md has the measurements behind the defaults.
+
+    Raises:
+        UserError: The transformer's batch cannot make its minibatches, or the discriminator's.
+    """
 
     transformer: PPOConfig = dataclasses.field(
         default_factory=lambda: PPOConfig(
@@ -50,6 +54,11 @@ class GARATConfig:
     gradient_penalty: float = 10.0  # Desai et al. 2020
     weight_penalty: float = 1e-3  # L2 on the weights, Desai et al. 2020; size by measurement
     centre_reward: bool = True  # of no effect where PPO standardises and the discount is 0
+
+    def __post_init__(self) -> None:
+        """Refuse what would fail when grounding begins, after hours of training policies."""
+        for num in (self.transformer.num_minibatches, self.num_minibatches):
+            minibatch_size(self.transformer.num_envs * self.transformer.num_steps, num)
 
 
 class Normaliser(NamedTuple):

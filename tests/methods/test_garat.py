@@ -10,6 +10,7 @@ import pytest
 
 from garat_jax import rollout
 from garat_jax.agents.ppo import PPOConfig
+from garat_jax.errors import UserError
 from garat_jax.methods.garat import (
     GARAT,
     GARATConfig,
@@ -97,12 +98,20 @@ def test_what_looks_like_the_target_is_paid_more(told_apart):
     assert (np.median(like_source) < like_target).mean() > 0.9
 
 
-def test_more_minibatches_than_steps_are_refused():
-    config = dataclasses.replace(SMALL, num_minibatches=513)  # of 16 times 32 steps
-    target = flat(record(TARGET, 1).transitions)
-    garat, state = start(config, target)
-    with pytest.raises(ValueError, match="a batch of 512 steps cannot make 513 minibatches"):
-        jax.eval_shape(garat.step, state, SOURCE, (), target)
+@pytest.mark.parametrize(
+    ("steps", "transformers", "discriminators", "said"),
+    [
+        (512, 4, 513, r"a batch of 512 steps cannot make 513 minibatches; expected 1 to 512 of th"),
+        (3, 4, 1, r"a batch of 3 steps cannot make 4 minibatches; expected 1 to 3 of them, or a l"),
+        (512, 0, 16, r"a batch of 512 steps cannot make 0 minibatches"),
+    ],
+)
+def test_minibatches_that_a_batch_cannot_make_are_refused_at_once(
+    steps, transformers, discriminators, said
+):
+    transformer = PPOConfig(num_envs=1, num_steps=steps, num_minibatches=transformers)
+    with pytest.raises(UserError, match=said):
+        GARATConfig(transformer=transformer, num_minibatches=discriminators)
 
 
 def test_centred_rewards_have_mean_zero_over_the_batch(told_apart):
