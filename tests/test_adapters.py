@@ -71,6 +71,14 @@ def test_steps_are_those_of_the_environment():
     assert (after.reward, after.done) == (1.0, 0.0)
 
 
+def test_a_typed_key_starts_the_episode_that_the_same_raw_key_does():
+    env = to_brax(Counter(), jnp.ones(()))
+    raw, typed = env.reset(jax.random.PRNGKey(3)), env.reset(jax.random.key(3))
+    for _ in range(2):
+        np.testing.assert_array_equal(raw.obs, typed.obs)
+        raw, typed = (env.step(state, jnp.zeros(2)) for state in (raw, typed))
+
+
 @pytest.fixture(scope="module")
 def wrapped():
     """Return what 5 steps in Brax's training wrappers give: states [5], each with a batch of 3."""

@@ -39,8 +39,9 @@ class BraxEnv(brax.envs.base.Env):
         self._half_range, self._middle = (high - low) / 2, (high + low) / 2
 
     def reset(self, rng: jax.Array) -> brax.envs.base.State:
-        """Start an episode from a raw key [2]."""
-        reset_key, key = jax.random.split(jax.random.wrap_key_data(rng))
+        """Start an episode from a key of JAX's default kind: raw, as Brax splits them, or typed."""
+        is_typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
+        reset_key, key = jax.random.split(rng if is_typed else jax.random.wrap_key_data(rng))
         state = self.env.reset(self.sys, reset_key)
         zero = jnp.zeros((), jnp.float32)
         info = {KEY: jax.random.key_data(key)}
