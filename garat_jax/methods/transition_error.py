@@ -13,7 +13,7 @@ from garat_jax.rollout import Recorded
 from garat_jax.types import Params
 
 CONSTANT_ACTIONS = 21
-"""Constant actions that the constant baseline tries, over the action's range."""
+"""Values of an actuator that the constant baseline tries, over its range."""
 
 
 class TransitionError(NamedTuple):
@@ -61,8 +61,19 @@ def constant_error(
 
 
 def best_constant(env: Env, params: Params, recorded: Recorded) -> jax.Array:
-    """Return the action [action_size], one of `CONSTANT_ACTIONS`, of least transition error."""
+    """Return the constant action [action_size] of least transition error that a search finds.
+
+    It tries `CONSTANT_ACTIONS` values of all actuators at once, the same fraction of the range of
+    each; then, from the best of those, as many values of each actuator by itself, one after the
+    other. Actions that differ from what is found in several actuators may be better still.
+    """
     fractions = jnp.linspace(0.0, 1.0, CONSTANT_ACTIONS)
-    actions = env.action_low + fractions[:, None] * (env.action_high - env.action_low)
-    errors = jax.lax.map(lambda action: constant_error(env, params, recorded, action).mean, actions)
-    return actions[jnp.nanargmin(errors)]
+    grid = env.action_low + fractions[:, None] * (env.action_high - env.action_low)
+
+    def search(action: jax.Array, moves: jax.Array) -> tuple[jax.Array, None]:
+        actions = jnp.where(moves, grid, action)
+        errors = jax.lax.map(lambda a: constant_error(env, params, recorded, a).mean, actions)
+        return actions[jnp.nanargmin(errors)], None
+
+    together, each = jnp.ones((1, env.action_size), bool), jnp.eye(env.action_size, dtype=bool)
+    return jax.lax.scan(search, grid[0], jnp.concatenate([together, each]))[0]

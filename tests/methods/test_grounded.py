@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from garat_jax import rollout
-from garat_jax.env import TaskEnv, make_world
+from garat_jax.env import EnvState, StepResult, TaskEnv, make_world
 from garat_jax.envs.half_cheetah import HalfCheetah
 from garat_jax.errors import UserError
 from garat_jax.methods.grounded import (
@@ -24,7 +24,7 @@ from garat_jax.methods.transition_error import (
     constant_error,
     transition_error,
 )
-from tests.probe_envs import Bursting, Walk, WalkParams
+from tests.probe_envs import Bursting, Probe, Walk, WalkParams
 
 ENV = Walk()  # actions from -2 to 1: middle -0.5, half-range 1.5
 GAIN = 0.2
@@ -152,6 +152,31 @@ def test_the_best_constant_action_is_sought_over_the_whole_range(number):
     action = np.linspace(-2, 1, CONSTANT_ACTIONS)[number]
     recorded = record_constant(float(action))
     assert best_constant(ENV, PARAMS, recorded) == pytest.approx(action)
+
+
+class Plane(Probe):
+    """Moves in the plane by its action."""
+
+    obs_size = 2
+    action_low, action_high = np.full(2, -1.0), np.full(2, 1.0)
+    episode_length = 5
+
+    def reset(self, params, key):
+        return EnvState(None, jnp.zeros(2), jnp.zeros((), jnp.int32))
+
+    def step(self, params, state, action, key):
+        after = EnvState(None, state.obs + self.clip(action), state.steps + 1)
+        return StepResult(after, jnp.zeros(()), after.steps < 0, after.steps >= 5)
+
+
+@pytest.mark.parametrize("action", [(0.9, -0.9), (-0.4, 0.7), (0.3, 0.3)])
+def test_the_best_constant_action_is_sought_for_each_actuator(action):
+    def constant(params, obs, key):
+        return jnp.asarray(action), jnp.zeros(())
+
+    recorded = rollout.record(Plane(), None, constant, (), jax.random.key(6), 2, 5)
+    found = jax.jit(lambda: best_constant(Plane(), None, recorded))()
+    assert found == pytest.approx(np.asarray(action), abs=1e-6)
 
 
 def test_the_error_is_that_of_the_sound_steps_and_says_how_many_were_not():
