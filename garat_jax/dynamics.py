@@ -19,9 +19,9 @@ from garat_jax._mjx import mjx
 from garat_jax.effects import Effect, ModelView, in_order
 from garat_jax.effects.bounds import check_bounds
 from garat_jax.engine import HostModel
-from garat_jax.errors import UserError, unknown_name
+from garat_jax.errors import unknown_name
 from garat_jax.mjx_model import put_model, with_fields
-from garat_jax.overrides import Override
+from garat_jax.overrides import Override, compiled
 from garat_jax.precision import full_precision
 from garat_jax.setconst import CONSTANT_INPUTS
 
@@ -99,16 +99,12 @@ def compile(
     for override in overrides:
         override.apply(spec)
     for effect in effects:
-        bare = spec.copy().compile()
+        bare = compiled(spec)
         effect.check(bare)
         check_bounds(effect, bare)
         effect.unlock(spec)
         effect.prepare(spec)
-    try:
-        native = spec.compile()
-    except ValueError as error:
-        raise UserError(f"MuJoCo cannot compile the model: {error}") from error
-    host = HostModel(native)
+    host = HostModel(compiled(spec))
     model = put_model(host.model) if engine == "mjx" else None
     as_arrays = jax.tree.map(jnp.asarray, effects)
     return Dynamics(effects=as_arrays, model=model, host=host, engine=engine)

@@ -121,7 +121,7 @@ def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:
     """Scale a body's inertial and its geoms: the compiler decides which of them counts."""
     if mass <= 0:
         raise UserError(f"body/{body.name} mass must be positive, not {mass:g} kg")
-    before = float(spec.copy().compile().body(body.name).mass[0])
+    before = float(compiled(spec).body(body.name).mass[0])
     if not before:
         raise UserError(
             f"body/{body.name} has no mass to scale; name a body that moves, with an inertial or "
@@ -136,12 +136,24 @@ def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:
             geom.mass = geom.mass * ratio
         else:
             geom.density = geom.density * ratio
-    compiled = float(spec.copy().compile().body(body.name).mass[0])
-    if abs(compiled - mass) > 1e-6 * mass:
+    after = float(compiled(spec).body(body.name).mass[0])
+    if abs(after - mass) > 1e-6 * mass:
         raise UserError(
-            f"body/{body.name} mass is {compiled:g} kg whatever is asked for: "
+            f"body/{body.name} mass is {after:g} kg whatever is asked for: "
             "settotalmass or boundmass of the model's compiler overrules it"
         )
+
+
+def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a copy of a spec, which stays as it is.
+
+    Raises:
+        UserError: MuJoCo refuses the model.
+    """
+    try:
+        return spec.copy().compile()
+    except ValueError as error:
+        raise UserError(f"MuJoCo cannot compile the model: {_line(error)}") from error
 
 
 def load_spec(mjcf: str | Path) -> mujoco.MjSpec:
@@ -156,4 +168,9 @@ def load_spec(mjcf: str | Path) -> mujoco.MjSpec:
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise UserError(f"{path}: {' '.join(str(error).split())}") from error
+        raise UserError(f"{path}: {_line(error)}") from error
+
+
+def _line(error: ValueError) -> str:
+    """Return what MuJoCo says of a model, in one line."""
+    return " ".join(str(error).split())

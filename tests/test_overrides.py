@@ -6,6 +6,7 @@ import pytest
 
 from garat_jax import dynamics
 from garat_jax.dynamics import Override
+from garat_jax.effects import ViscousDamping
 from garat_jax.errors import UserError
 from tests.models import PENDULUM, spec
 
@@ -69,6 +70,15 @@ def test_options_that_are_words_in_mjcf_take_the_word_or_the_number():
 def test_a_wrong_override_is_refused_in_one_line(override, message):
     with pytest.raises(UserError, match=message) as error:
         compiled(override)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("effects", [(), (ViscousDamping("joint/hinge", coefficient=0.1),)])
+@pytest.mark.parametrize("more", [(), (Override("body", "pole", "mass", 2.0),)])
+def test_overrides_with_which_mujoco_cannot_compile_are_refused_in_one_line(effects, more):
+    wrong = Override("joint", "hinge", "limited", 1), Override("joint", "hinge", "range", [1, -1])
+    with pytest.raises(UserError, match=r"MuJoCo cannot compile the model: .*range") as error:
+        dynamics.compile(spec(PENDULUM), (*wrong, *more), effects, "mujoco")
     assert "\n" not in str(error.value)
 
 
