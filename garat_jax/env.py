@@ -67,6 +67,8 @@ class GuardedStep(NamedTuple):
 class Task(abc.ABC):
     """What an agent is asked to do with a model; stateless and without parameters.
 
+    A task is a frozen dataclass, for runs write down its fields.
+
     Attributes:
         mjcf: The model.
         num_substeps: Physics substeps in a control step.
@@ -177,12 +179,12 @@ class TaskEnv(Env):
 
     Raises:
         UserError: A control step lasts longer or shorter than the task's reward counts on, or the
-            task returns something else than a `Task` does.
+            task is no dataclass or returns something else than a `Task` does.
     """
 
     def __init__(self, task: Task, world: Dynamics, transform: Transform | None = None):
         host = world.host.model
-        _check_lengths(task)
+        _check_settings(task)
         _check_duration(task, task.num_substeps * world.timestep)
         self.transform = transform
         limited = host.actuator_ctrllimited.astype(bool)
@@ -249,7 +251,12 @@ def _as_float(value: Any) -> jax.Array:
     return array.astype(jnp.result_type(array, jnp.float32))
 
 
-def _check_lengths(task: Task) -> None:
+def _check_settings(task: Task) -> None:
+    if not dataclasses.is_dataclass(task):
+        raise UserError(
+            f"{type(task).__name__} is a plain class, whose settings a run cannot write down; "
+            "make it a dataclass: @dataclasses.dataclass(frozen=True)"
+        )
     for name in ("num_substeps", "episode_length"):
         value = getattr(task, name)
         if not isinstance(value, int | np.integer) or value < 1:
@@ -334,7 +341,7 @@ def make_world(
     """Compile a task's model with overrides and effects.
 
     Raises:
-        UserError: As `dynamics.compile`.
+        UserError: As `dynamics.compile` and `TaskEnv`.
     """
     params = dynamics.compile(load_spec(task.mjcf), overrides, effects, engine)
     return World(TaskEnv(task, params), params)

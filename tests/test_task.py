@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from garat_jax import rollout
-from garat_jax.env import make_world
+from garat_jax.env import Task, make_world
 from garat_jax.errors import UserError
 from tests import models
 from tests.probe_envs import Hang
@@ -32,6 +32,14 @@ def arm(tmp_path):
 def test_lengths_are_whole_numbers_from_1(arm, settings, said):
     with pytest.raises(UserError, match=said):
         make_world(dataclasses.replace(Hang(arm), **settings), engine="mujoco")
+
+
+def test_a_task_whose_settings_cannot_be_written_down_is_refused(arm):
+    methods = {name: vars(Hang)[name] for name in Task.__abstractmethods__}
+    settings = {"mjcf": arm, "num_substeps": 1, "episode_length": 20, "solved_return": 1.0}
+    plain = type("Plain", (Task,), methods | settings)
+    with pytest.raises(UserError, match=r"Plain is a plain class, .* make it a dataclass"):
+        make_world(plain(), engine="mujoco")
 
 
 @pytest.mark.parametrize(
