@@ -13,6 +13,8 @@ from garat_jax.effects.elements import element_id
 AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+NUM_GROUPS = 31
+"""Groups of actuators, from 0 on, that `actuatorgroupdisable` can name."""
 NOTICED = 0.1
 """Acceleration [rad/s², m/s²] that a recording shows."""
 
@@ -56,12 +58,24 @@ def clamps(host: mujoco.MjModel) -> np.ndarray:
     return host.actuator_ctrllimited.astype(bool)
 
 
+def switched_off(host: mujoco.MjModel) -> np.ndarray:
+    """Say which actuators the model disables, by their group or all at once, [nu] bool."""
+    if host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
+        return np.ones(host.nu, bool)
+    group = host.actuator_group
+    has_bit = (group >= 0) & (group < NUM_GROUPS)
+    return has_bit & (host.opt.disableactuator >> np.where(has_bit, group, 0) & 1).astype(bool)
+
+
 def drivers(host: mujoco.MjModel, joint: int) -> list[int]:
-    """List the actuators that act on a joint."""
+    """List the actuators that act on a joint, without those that are switched off."""
+    off = switched_off(host)
     return [
         i
         for i in range(host.nu)
-        if host.actuator_trntype[i] in AT_JOINT and host.actuator_trnid[i, 0] == joint
+        if host.actuator_trntype[i] in AT_JOINT
+        and host.actuator_trnid[i, 0] == joint
+        and not off[i]
     ]
 
 
