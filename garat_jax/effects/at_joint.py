@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.effects.base import ModelView
-from garat_jax.effects.elements import element_id
+from garat_jax.effects.elements import element_id, num_actuators
 
 AT_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
@@ -68,11 +68,15 @@ def switched_off(host: mujoco.MjModel) -> np.ndarray:
 
 
 def drivers(host: mujoco.MjModel, joint: int) -> list[int]:
-    """List the actuators that act on a joint, without those that are switched off."""
+    """List the actuators that act on a joint, without those that are switched off.
+
+    Raises:
+        UserError: As `num_actuators`.
+    """
     off = switched_off(host)
     return [
         i
-        for i in range(host.nu)
+        for i in range(num_actuators(host))
         if host.actuator_trntype[i] in AT_JOINT
         and host.actuator_trnid[i, 0] == joint
         and not off[i]

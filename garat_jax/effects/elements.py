@@ -5,8 +5,9 @@ from collections.abc import Callable
 from typing import Any
 
 import mujoco
+import numpy as np
 
-from garat_jax.errors import unknown_name
+from garat_jax.errors import UserError, unknown_name
 
 DOFS_OF_JOINT = {
     int(mujoco.mjtJoint.mjJNT_FREE): 6,
@@ -21,13 +22,33 @@ OBJECT_TYPES = {
     "geom": mujoco.mjtObj.mjOBJ_GEOM,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
 }
-COUNTS = {"body": "nbody", "joint": "njnt", "geom": "ngeom", "actuator": "nu"}
+COUNTS = {"body": "nbody", "joint": "njnt", "geom": "ngeom"}
 
 
 def element_names(host: mujoco.MjModel, element: str) -> list[str]:
-    """List the names of a model's bodies, joints, geoms or actuators; nameless ones are ''."""
-    kind = OBJECT_TYPES[element]
-    return [mujoco.mj_id2name(host, kind, i) or "" for i in range(getattr(host, COUNTS[element]))]
+    """List the names of a model's bodies, joints, geoms or actuators; nameless ones are ''.
+
+    Raises:
+        UserError: Of actuators, as `num_actuators`.
+    """
+    num = num_actuators(host) if element == "actuator" else getattr(host, COUNTS[element])
+    return [mujoco.mj_id2name(host, OBJECT_TYPES[element], i) or "" for i in range(num)]
+
+
+def num_actuators(host: mujoco.MjModel) -> int:
+    """Return how many actuators a model has, each of which has one command.
+
+    Raises:
+        UserError: One takes several commands, so that its number is not its command's.
+    """
+    if host.nactuator != host.nu:
+        several = np.flatnonzero(host.actuator_ctrlnum != 1)
+        names = [mujoco.mj_id2name(host, OBJECT_TYPES["actuator"], i) or str(i) for i in several]
+        raise UserError(
+            f"actuator/{', actuator/'.join(names)} does not take one command, as pid and "
+            "orientation do not; effects and recordings need a model whose actuators do"
+        )
+    return host.nu
 
 
 def element_id(host: mujoco.MjModel, element: str, name: str) -> int:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from garat_jax import dynamics
-from garat_jax.effects import Backlash, JointFlexibility, LoadFriction
+from garat_jax.effects import Backlash, JointFlexibility, LoadFriction, MotorDeadband
 from garat_jax.effects.at_joint import switched_off
+from garat_jax.errors import UserError
 from tests.models import spec
 
 SERVO = '<position name="servo" joint="hinge" kp="5" kv="1" group="1"/>'
@@ -52,3 +53,13 @@ def test_groups_and_a_flag_switch_actuators_off():
         '"implicitfast"/>', '"implicitfast"><flag actuation="disable"/></option>'
     )
     assert switched_off(spec(flagged).compile()).all()
+
+
+@pytest.mark.parametrize(
+    "effect", [MotorDeadband("actuator/motor", width=0.1), LoadFriction("joint/hinge", ratio=0.3)]
+)
+def test_a_law_does_not_take_a_command_for_that_of_another_actuator(effect):
+    before = TWO.replace("<actuator>", '<actuator><pid name="angle" joint="hinge" kp="3"/>') % ""
+    assert dynamics.compile(spec(before), engine="mujoco").host.model.nu == 3
+    with pytest.raises(UserError, match=r"^actuator/angle does not take one command"):
+        dynamics.compile(spec(before), effects=(effect,))
