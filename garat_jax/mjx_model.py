@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from garat_jax._mjx import mjx
+from garat_jax.effects.at_joint import off_by_group
 from garat_jax.errors import UserError
 from garat_jax.precision import full_precision
 from garat_jax.setconst import CONSTANT_INPUTS, set_const
@@ -28,6 +29,8 @@ def put_model(model: mujoco.MjModel) -> mjx.Model:
             raise UserError(
                 f"engine mjx cannot step this model: it ignores {feature} ({at}); {hint}"
             )
+    if options := ", ".join(_ignored_options(model)):
+        raise UserError(f"engine mjx cannot step this model: it ignores {options}; {HINT}")
     if model.nplugin:
         raise UserError("engine mjx cannot step this model: it ignores plugins; take them out")
     try:
@@ -58,7 +61,7 @@ def with_fields(
 
 
 def _ignored(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray, str]]:
-    """Yield what MJX 3.17 leaves out without a word: feature, element, which have it, a hint."""
+    """Yield what MJX 4.0 leaves out without a word: feature, element, which have it, a hint."""
     bent = np.unique(model.dof_jntid[model.dof_dampingpoly.any(axis=1)])
     yield "polynomial damping", "joint", np.isin(np.arange(model.njnt), bent), HINT
     yield "polynomial stiffness", "joint", model.jnt_stiffnesspoly.any(axis=1), HINT
@@ -67,8 +70,32 @@ def _ignored(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray, str]
     damped = (model.actuator_damping != 0) | model.actuator_dampingpoly.any(axis=1)
     yield "an actuator's damping", "actuator", damped, HINT
     yield "an actuator's armature", "actuator", model.actuator_armature != 0, HINT
+    yield "springyield", "joint", model.jnt_springyield > 0, HINT
+    yield "springyield", "tendon", model.tendon_springyield > 0, HINT
+    early = model.actuator_actearly.astype(bool) & (model.actuator_actnum > 0)
+    yield "actearly", "actuator", early, HINT
+    yield "that a group is off", "actuator", off_by_group(model), HINT
+    yield "surfacevel", "geom", model.geom_surfacevel.any(axis=1), HINT
+    yield "adhesion", "geom", model.geom_adhesion != 0, HINT
+    has_fluid = model.opt.density > 0 or model.opt.viscosity > 0
+    yield "fluidshape", "geom", has_fluid & (model.geom_fluid[:, 0] > 0), HINT
     yield "a native delay", "actuator", model.actuator_delay > 0, DELAY_HINT
     yield "a native delay or interval", "sensor", model.sensor_history[:, 0] > 0, DELAY_HINT
+
+
+def _ignored_options(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield the same of options.
+
+    MJX takes springs, dampers and gravity compensation away together where one of the two is off.
+    """
+    bits = mujoco.mjtDisableBit
+    passive = bits.mjDSBL_SPRING | bits.mjDSBL_DAMPER
+    if model.opt.disableflags & passive not in (0, passive):
+        yield "that of springs and dampers one alone is disabled"
+    if model.opt.noslip_iterations > 0:
+        yield "noslip_iterations"
+    if model.pair_adhesion.any():
+        yield "the adhesion of pairs"
 
 
 def _name(model: mujoco.MjModel, element: str, index: int) -> str:

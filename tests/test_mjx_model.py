@@ -28,10 +28,30 @@ IGNORED = {
     "motor's armature": (
         'joint="hinge" c', 'joint="hinge" armature="0.3" c', "armature (actuator/motor)",
     ),
+    "yielding spring": (
+        'damping="0.01"', 'stiffness="1" springyield="3"', "springyield (joint/hinge)",
+    ),
+    "yielding cord": (
+        "<actuator>", TENDON.format("stiffness='1' springyield='0.1'"), "springyield (tendon/cord)",
+    ),
+    "early activation": (
+        '<motor name="motor"', '<general actearly="true" dyntype="filter" name="motor"',
+        "actearly (actuator/motor)",
+    ),
+    "group": (
+        'integrator="Euler"', 'actuatorgroupdisable="0"', "a group is off (actuator/motor)",
+    ),
+    "belt": ('type="capsule"', 'type="capsule" surfacevel="1 0 0 0 0 0"', "surfacevel (geom/rod)"),
+    "adhesion": ('type="capsule"', 'type="capsule" adhesion="3"', "adhesion (geom/rod)"),
     "sensor's delay": (
         "<jointpos", '<jointpos delay="0.01" nsample="10"', "a native delay or interval (sensor/an",
     ),
 }  # fmt: skip
+OPTIONS = {
+    "springs": ('integrator="Euler"><flag spring="disable"/></option>', "one alone is disabled"),
+    "dampers": ('integrator="Euler"><flag damper="disable"/></option>', "one alone is disabled"),
+    "no slip": ('noslip_iterations="3"/>', "noslip_iterations"),
+}
 DCMOTOR = PENDULUM.replace(
     '<motor name="motor" joint="hinge" ctrlrange="-3 3" ctrllimited="true"/>',
     '<dcmotor name="motor" joint="hinge" motorconst="0.1" resistance="1"/>',
@@ -55,6 +75,20 @@ def test_what_mjx_would_ignore_is_refused_by_name(case):
     message = refusal(PENDULUM.replace(old, new))
     assert said in message
     assert ("effect actuator_delay" if "delay" in case else "use engine mujoco") in message
+
+
+@pytest.mark.parametrize("case", OPTIONS)
+def test_options_that_mjx_would_ignore_are_refused(case):
+    new, said = OPTIONS[case]
+    message = refusal(PENDULUM.replace('integrator="Euler"/>', new))
+    assert said in message
+    assert "use engine mujoco" in message
+
+
+def test_a_shape_that_a_fluid_feels_is_refused_in_a_fluid_alone():
+    shaped = PENDULUM.replace('type="capsule"', 'type="capsule" fluidshape="ellipsoid"')
+    assert dynamics.compile(spec(shaped), engine="mjx").engine == "mjx"
+    assert "fluidshape (geom/rod)" in refusal(shaped.replace("<option", '<option density="9"', 1))
 
 
 def test_on_an_accelerator_auto_refuses_alike(monkeypatch):

@@ -58,10 +58,8 @@ def clamps(host: mujoco.MjModel) -> np.ndarray:
     return host.actuator_ctrllimited.astype(bool)
 
 
-def switched_off(host: mujoco.MjModel) -> np.ndarray:
-    """Say which actuators the model disables, by their group or all at once, [nu] bool."""
-    if host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
-        return np.ones(host.nu, bool)
+def off_by_group(host: mujoco.MjModel) -> np.ndarray:
+    """Say which actuators are in a group that the model disables, [actuators] bool."""
     group = host.actuator_group
     has_bit = (group >= 0) & (group < NUM_GROUPS)
     return has_bit & (host.opt.disableactuator >> np.where(has_bit, group, 0) & 1).astype(bool)
@@ -73,7 +71,9 @@ def drivers(host: mujoco.MjModel, joint: int) -> list[int]:
     Raises:
         UserError: As `num_actuators`.
     """
-    off = switched_off(host)
+    if host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
+        return []
+    off = off_by_group(host)
     return [
         i
         for i in range(num_actuators(host))

@@ -2,12 +2,13 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from garat_jax import dynamics
 from garat_jax.effects import Backlash, JointFlexibility, LoadFriction, MotorDeadband
-from garat_jax.effects.at_joint import switched_off
+from garat_jax.effects.at_joint import drivers
 from garat_jax.errors import UserError
 from tests.models import spec
 
@@ -44,15 +45,13 @@ def test_an_actuator_of_a_group_that_is_off_gives_nothing(name):
     np.testing.assert_allclose(after(TWO % SERVO, [0.3, 1.0]), after(TWO % "", [0.3]), rtol=1e-9)
 
 
-def test_groups_and_a_flag_switch_actuators_off():
+def test_a_flag_switches_all_actuators_off():
     model = spec(TWO % SERVO).compile()
-    assert list(switched_off(model)) == [False, True]
+    assert drivers(model, 0) == [0]
     model.actuator_group[1] = -1
-    assert not switched_off(model).any()
-    flagged = (TWO % SERVO).replace(
-        '"implicitfast"/>', '"implicitfast"><flag actuation="disable"/></option>'
-    )
-    assert switched_off(spec(flagged).compile()).all()
+    assert drivers(model, 0) == [0, 1]
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    assert drivers(model, 0) == []
 
 
 @pytest.mark.parametrize(
