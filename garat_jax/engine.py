@@ -125,6 +125,11 @@ class HostModel:
                 "engine mujoco does not carry plugins or native delays, and MJX ignores them; take "
                 "them out of the model (for a delay give the effect actuator_delay or sensor_delay)"
             )
+        if self.model.nplastic:
+            raise UserError(
+                "engine mujoco does not carry how far a spring has yielded, and MJX ignores that; "
+                "take springyield out of the model"
+            )
         row = jnp.concatenate(
             [state.time[None], state.qpos, state.qvel, state.act, state.qacc_warmstart]
         )

@@ -13,6 +13,7 @@ from garat_jax.precision import full_precision
 from garat_jax.setconst import CONSTANT_INPUTS, set_const
 
 HINT = "use engine mujoco, which JAX_PLATFORMS=cpu chooses"
+YIELD_HINT = "take it out of the model: engine mujoco does not carry it either"
 DELAY_HINT = "take it out of the model, and give the effect actuator_delay or sensor_delay"
 
 
@@ -70,8 +71,8 @@ def _ignored(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray, str]
     damped = (model.actuator_damping != 0) | model.actuator_dampingpoly.any(axis=1)
     yield "an actuator's damping", "actuator", damped, HINT
     yield "an actuator's armature", "actuator", model.actuator_armature != 0, HINT
-    yield "springyield", "joint", model.jnt_springyield > 0, HINT
-    yield "springyield", "tendon", model.tendon_springyield > 0, HINT
+    yield "springyield", "joint", model.jnt_springyield > 0, YIELD_HINT
+    yield "springyield", "tendon", model.tendon_springyield > 0, YIELD_HINT
     early = model.actuator_actearly.astype(bool) & (model.actuator_actnum > 0)
     yield "actearly", "actuator", early, HINT
     yield "that a group is off", "actuator", off_by_group(model), HINT

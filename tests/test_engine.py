@@ -48,6 +48,14 @@ def test_a_model_that_sleeps_is_refused(name):
         dynamics.compile(spec(sleepy), engine=name)
 
 
+def test_a_spring_that_yields_is_refused_since_it_remembers():
+    yielding = ARM.replace('damping="0.02"', 'stiffness="1" springyield="3"')
+    world = dynamics.compile(spec(yielding), engine="mujoco")
+    state = dynamics.initial_state(world, jnp.zeros(2), jnp.zeros(2))
+    with pytest.raises(UserError, match=r"springyield"):
+        dynamics.step(world, state, jnp.zeros(2))
+
+
 @pytest.mark.parametrize("name", ["mujoco", "mjx"])
 def test_a_command_that_is_no_number_is_a_faulty_step(name):
     world = make_world(InvertedPendulum(), engine=name)
