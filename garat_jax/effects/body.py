@@ -271,6 +271,7 @@ def write_inertials(spec: mujoco.MjSpec, name: str = "") -> None:
             body.explicitinertial = True
             body.mass, body.ipos = compiled.mass[0], compiled.ipos
             body.iquat, body.inertia = compiled.iquat, compiled.inertia
+            body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
             body.fullinertia = [float("nan")] * 6
 
 

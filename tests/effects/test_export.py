@@ -21,11 +21,14 @@ from tests.models import ARM, SLIDER, spec
 PAYLOAD = PayloadMass("body/forearm", mass=0.5, x=0.2, z=-0.05)
 OFFSET = ComOffset("body/upper", x=0.03, z=0.05)
 FRICTION = ContactFriction("geom/ball", sliding=0.2)
+GEOMS = ARM.replace("<option", '<compiler inertiafromgeom="true"/><option')
+TURNED = '<inertial pos="0 0 0" euler="90 0 0" mass="1" diaginertia="0.02 0.02 0.02"/>'
 CASES = {
     "payload": (ARM, (PAYLOAD,)),
     "offset": (ARM, (OFFSET,)),
-    "offset and payload, inertia from geoms": (
-        ARM.replace("<option", '<compiler inertiafromgeom="true"/><option'), (OFFSET, PAYLOAD),
+    "offset and payload, inertia from geoms": (GEOMS, (OFFSET, PAYLOAD)),
+    "offset, inertia from geoms beside one that is turned": (
+        GEOMS.replace('<joint name="sh', TURNED + '<joint name="sh'), (OFFSET,),
     ),
     "gravity": (ARM, (GravityScale("world", scale=0.4), GravityTilt("world", 0.3, -0.2))),
     "friction": (SLIDER, (FRICTION,)),
