@@ -186,7 +186,8 @@ class ActuatorDelay(Effect):
         past, count = memory
         late = self._actuators(model.host)
         length = past.shape[0]
-        past = past.at[count % length].set(ctrl[late].astype(past.dtype))
+        command = clamped(model.host, ctrl)[late]
+        past = past.at[count % length].set(command.astype(past.dtype))
         substeps = jnp.clip(self.delay / model.host.opt.timestep, 0, length - 2)
         whole = jnp.floor(substeps).astype(jnp.int32)
         fraction = (substeps - whole).astype(ctrl.dtype)

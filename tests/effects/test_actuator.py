@@ -9,6 +9,7 @@ import pytest
 from garat_jax import dynamics
 from garat_jax.effects import (
     CATALOGUE,
+    ActuatorDelay,
     ActuatorLag,
     BackEmf,
     Backlash,
@@ -167,6 +168,17 @@ def test_a_lag_is_the_mean_of_the_exact_solution():
     exact = 2.0 - np.exp(-fine / 0.01)
     means = [exact[i : i + 2001].mean() for i in (0, 2000, 4000)]
     np.testing.assert_allclose(acting, [1.0, *means], atol=1e-5)
+
+
+def test_a_command_beyond_its_range_is_late_as_it_acts():
+    """Between two substeps the mean of what acts counts: a half of 3, not the 3 that 5 becomes."""
+    world = dynamics.compile(spec(RIG), effects=(ActuatorDelay("all", 0.003),), engine="mujoco")
+    effect, view = world.effects[0], dynamics.view(world)
+    memory, acting = effect.init(world.host.model), []
+    for command in (0.0, 10.0, 10.0, 10.0):
+        ctrl, _, memory = effect.apply(view, None, jnp.asarray([command]), memory)
+        acting.append(float(ctrl[0]))
+    np.testing.assert_allclose(acting, [0.0, 0.0, 1.5, 3.0])
 
 
 def test_springs_add_up_to_one():
