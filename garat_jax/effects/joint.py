@@ -178,10 +178,13 @@ class JointStiffness(Effect):
         }
 
     def export(self, spec: mujoco.MjSpec) -> str:
-        """Put both springs into one."""
+        """Put both springs into one; tendons keep the lengths at which they rest."""
         joint = spec.joint(self.name)
         own, added = float(joint.stiffness[0]), float(self.stiffness)
         if added:
+            lengths = spec.copy().compile().tendon_lengthspring
+            for tendon, length in zip(spec.tendons, lengths, strict=True):
+                tendon.springlength = length  # else the compiler measures it at the new springref
             degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
             reference = np.rad2deg(self.reference) if degrees else self.reference
             pull = own * joint.springref + added * float(reference)

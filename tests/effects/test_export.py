@@ -14,6 +14,7 @@ from garat_jax.effects import (
     EncoderOffset,
     GravityScale,
     GravityTilt,
+    JointStiffness,
     PayloadMass,
 )
 from tests.models import ARM, SLIDER, spec
@@ -23,12 +24,17 @@ OFFSET = ComOffset("body/upper", x=0.03, z=0.05)
 FRICTION = ContactFriction("geom/ball", sliding=0.2)
 GEOMS = ARM.replace("<option", '<compiler inertiafromgeom="true"/><option')
 TURNED = '<inertial pos="0 0 0" euler="90 0 0" mass="1" diaginertia="0.02 0.02 0.02"/>'
+CORD = """<tendon><fixed name="cord" stiffness="3"><joint joint="elbow" coef="1"/>
+  <joint joint="shoulder" coef="-0.5"/></fixed></tendon><actuator>"""
 CASES = {
     "payload": (ARM, (PAYLOAD,)),
     "offset": (ARM, (OFFSET,)),
     "offset and payload, inertia from geoms": (GEOMS, (OFFSET, PAYLOAD)),
     "offset, inertia from geoms beside one that is turned": (
         GEOMS.replace('<joint name="sh', TURNED + '<joint name="sh'), (OFFSET,),
+    ),
+    "spring beside a tendon's": (
+        ARM.replace("<actuator>", CORD), (JointStiffness("joint/elbow", 1.5, 0.6),),
     ),
     "gravity": (ARM, (GravityScale("world", scale=0.4), GravityTilt("world", 0.3, -0.2))),
     "friction": (SLIDER, (FRICTION,)),
