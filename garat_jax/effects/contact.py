@@ -71,10 +71,9 @@ class ContactEffect(Effect):
         """Return the numbers of all possible contacts as MuJoCo joins them, [n, parameters]."""
         num, rows = len(cls.parameters()), []
         for other in partners(host, geom):
-            first = host.geom_priority[geom] - host.geom_priority[other]
-            deciding = geom if first > 0 else other
-            own = getattr(host, f"geom_{cls.contact_field}")[deciding, :num]
-            rows.append(own if first else cls.join(host, geom, other))
+            deciding = _deciding(host, geom, other)
+            own = getattr(host, f"geom_{cls.contact_field}")[deciding[0], :num]
+            rows.append(own if len(deciding) == 1 else cls.join(host, geom, other))
         rows += [*getattr(host, f"pair_{cls.contact_field}")[_pairs(host, geom), :num]]
         joined = np.reshape(rows, (-1, num))
         return joined[np.all(joined > 0, axis=1)]
@@ -88,7 +87,9 @@ class ContactEffect(Effect):
         for other in partners(host, index):
             geoms[other].name = geoms[other].name or f"{NAMELESS}{other}"
             pair = spec.add_pair(geomname1=self.name, geomname2=geoms[other].name)
-            pair.condim = _dimension(host, index, other)
+            deciding = _deciding(host, index, other)
+            pair.condim = int(host.geom_condim[deciding].max())
+            pair.adhesion = float(host.geom_adhesion[deciding].sum())
             pair.margin = host.geom_margin[index] + host.geom_margin[other]
             pair.gap = host.geom_gap[index] + host.geom_gap[other]
             for joined, length in (("friction", 5), ("solref", 2), ("solimp", 5)):
@@ -244,7 +245,7 @@ def _can_touch(host: mujoco.MjModel, a: int, b: int) -> bool:
     return weld != other_parent and other != parent
 
 
-def _dimension(host: mujoco.MjModel, a: int, b: int) -> int:
-    if host.geom_priority[a] != host.geom_priority[b]:
-        return int(host.geom_condim[max(a, b, key=lambda geom: host.geom_priority[geom])])
-    return int(max(host.geom_condim[a], host.geom_condim[b]))
+def _deciding(host: mujoco.MjModel, a: int, b: int) -> list[int]:
+    """Return which of two geoms decide about their contact: the one with priority, or both."""
+    most = max(host.geom_priority[[a, b]])
+    return [geom for geom in (a, b) if host.geom_priority[geom] == most]

@@ -14,10 +14,12 @@ from tests.models import ARM, SLIDER, TUMBLER, spec
 
 PAIRED = """
 <mujoco><worldbody>
-  <geom type="plane" size="5 5 0.1" friction="1.2" margin="0.002" solref="0.04 1"/>
+  <geom type="plane" size="5 5 0.1" friction="1.2" margin="0.002" solref="0.04 1"
+        adhesion="2"/>
   <geom name="ice" type="box" size="1 1 0.1" pos="3 0 0" friction="0.1" priority="2"/>
   <body name="puck" pos="0 0 0.0995"><freejoint/>
-    <geom name="ball" size="0.1" condim="4" friction="0.4" margin="0.001" solmix="3"/>
+    <geom name="ball" size="0.1" condim="4" friction="0.4" margin="0.001" solmix="3"
+          adhesion="5"/>
     <body pos="0 0 0.25"><joint/><geom name="hat" size="0.1"/></body></body>
   <body name="other" pos="0 3 0.3"><freejoint/><geom name="rock" size="0.1"/></body></worldbody>
   <contact><pair geom1="ball" geom2="rock" friction="0.7 0.7 0.1 0.1 0.1"/></contact></mujoco>
@@ -72,7 +74,7 @@ def test_a_named_contact_has_the_numbers_of_an_unnamed_one():
         mujoco.mj_forward(model, data)
         assert data.ncon == 1
         contacts.append(data.contact)
-    for name in ("friction", "solref", "solimp", "dim", "includemargin", "dist"):
+    for name in ("friction", "solref", "solimp", "dim", "includemargin", "dist", "adhesion"):
         np.testing.assert_allclose(*(getattr(c, name) for c in contacts), err_msg=name)
 
 
