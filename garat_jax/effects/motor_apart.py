@@ -4,7 +4,8 @@ The motor is a body of its own, which the engine does not know. Its inertia is t
 armature, which leaves the joint; its angle and speed relative to the joint are memory. The joint's
 actuators act on it, and servos see its angle and speed; the actuators' torque at the joint is
 taken away again. Friction, damping and limits stay at the joint, and so does the armature that
-`rotor_inertia` adds.
+`rotor_inertia` adds; actuators with an armature or a damping of their own, which belong to the
+motor, are refused.
 """
 
 import abc
@@ -16,7 +17,15 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from garat_jax.effects.at_joint import Drive, at_dof, drive, feedback, has_limit, is_driven
+from garat_jax.effects.at_joint import (
+    Drive,
+    at_dof,
+    drive,
+    drivers,
+    feedback,
+    has_limit,
+    is_driven,
+)
 from garat_jax.effects.base import Effect, ModelView
 from garat_jax.effects.elements import element_id
 from garat_jax.effects.motor_body import add_gear, add_motor
@@ -95,8 +104,8 @@ class Transmission(Effect, abc.ABC):
 
     elements: ClassVar[tuple[str, ...]] = ("joint",)
     needs: ClassVar[str] = (
-        "a joint with motors or servos without dynamics, an armature above 0 (the motor's "
-        "inertia), and an integrator other than RK4"
+        "a joint with motors or servos without dynamics, armature or damping of their own, an "
+        "armature above 0 of the joint (the motor's inertia), and an integrator other than RK4"
     )
     acts: ClassVar[bool] = True
     reads_state: ClassVar[bool] = True
@@ -109,6 +118,10 @@ class Transmission(Effect, abc.ABC):
     def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
         """Say whether the joint has a motor with inertia, and an integrator that is implicit."""
         if not super().fits(host, element, name) or not is_driven(host, name):
+            return False
+        at = drivers(host, element_id(host, "joint", name))
+        own = (host.actuator_armature[at], host.actuator_damping[at], host.actuator_dampingpoly[at])
+        if any(np.any(values) for values in own):
             return False
         moving = host.dof_armature[host.joint(name).dofadr[0]] > 0
         return bool(moving) and host.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4

@@ -222,9 +222,15 @@ def test_the_motor_goes_where_its_joint_is_put():
     assert np.abs(after.qvel - 0.0).max() < 0.2
 
 
-@pytest.mark.parametrize(
-    "mjcf", [PENDULUM, RIG.replace("/>", ' integrator="RK4"/>', 1)], ids=["no rotor", "RK4"]
-)
+IMPOSSIBLE = {
+    "no rotor": PENDULUM,
+    "RK4": RIG.replace("/>", ' integrator="RK4"/>', 1),
+    "armature of an actuator": RIG.replace('gear="2"', 'gear="2" armature="0.1"'),
+    "damping of an actuator": RIG.replace('gear="2"', 'gear="2" damping="0.1"'),
+}
+
+
+@pytest.mark.parametrize("mjcf", IMPOSSIBLE.values(), ids=IMPOSSIBLE)
 def test_a_joint_without_a_motor_that_can_turn_is_refused(mjcf):
     with pytest.raises(UserError, match=r"armature above 0.*other than RK4"):
         dynamics.compile(spec(mjcf), effects=(Backlash("joint/hinge", gap=0.1),))
