@@ -12,7 +12,7 @@ from flax import struct
 from scipy import optimize, signal
 
 from garat_jax.effects.actuator import can_bias, is_limited, make_affine
-from garat_jax.effects.at_joint import at_dof, small_torque
+from garat_jax.effects.at_joint import at_dof, drivers, small_torque
 from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
 from garat_jax.effects.elements import element_id
 from garat_jax.effects.most import follow_most, median_distance
@@ -94,13 +94,11 @@ class TorqueOffset(Effect):
 
     def export(self, spec: mujoco.MjSpec) -> str:
         """Add to the bias of an unlimited actuator at an unlimited joint, if there is one."""
-        joint = spec.joint(self.name)
+        joint, host = spec.joint(self.name), spec.copy().compile()
         is_clamped = is_limited(joint.actfrclimited, joint.actfrcrange)
-        for actuator in spec.actuators:
-            at_joint = (
-                actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target == self.name
-            )
-            if at_joint and not is_clamped and can_bias(actuator):
+        for index in drivers(host, element_id(host, "joint", self.name)):
+            actuator = spec.actuators[index]
+            if not is_clamped and can_bias(actuator):
                 make_affine(actuator)
                 actuator.biasprm[0] += float(self.torque) / actuator.gear[0]
                 return ""

@@ -95,3 +95,10 @@ def test_what_mjx_would_ignore_of_an_exported_model_is_said_and_refused(kind):
 def test_an_offset_without_an_unlimited_actuator_is_said():
     changed = spec(RIG.replace('gear="2"', 'gear="2" forcerange="-1 1"'))
     assert "no unlimited actuator" in make("torque_offset", {"torque": 0.1}).export(changed)
+
+
+def test_an_offset_is_not_left_to_an_actuator_that_is_off():
+    off = RIG.replace('gear="2"', 'gear="2" group="1"')
+    changed = spec(off.replace("<option", '<option actuatorgroupdisable="1"'))
+    assert "no unlimited actuator" in make("torque_offset", {"torque": 0.1}).export(changed)
+    assert make("torque_offset", {"torque": 0.1}).export(spec(off)) == ""
