@@ -62,7 +62,7 @@ def with_fields(
 
 
 def _ignored(model: mujoco.MjModel) -> Iterator[tuple[str, str, np.ndarray, str]]:
-    """Yield what MJX 4.0 leaves out without a word: feature, element, which have it, a hint."""
+    """Yield what MJX 3.17 leaves out without a word: feature, element, which have it, a hint."""
     bent = np.unique(model.dof_jntid[model.dof_dampingpoly.any(axis=1)])
     yield "polynomial damping", "joint", np.isin(np.arange(model.njnt), bent), HINT
     yield "polynomial stiffness", "joint", model.jnt_stiffnesspoly.any(axis=1), HINT
