@@ -6,12 +6,14 @@ integrator to give no force.
 """
 
 import copy
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from garat_jax.effects.elements import element_names
+from garat_jax.errors import UserError
 
 if TYPE_CHECKING:
     from garat_jax.diagnosis.measurements import Recording
@@ -44,6 +46,26 @@ def known_spans(recording: "Recording", seconds: float) -> tuple[tuple[int, int]
     """Return the spans of a recording in which activations are known: not in its first seconds."""
     first = int(np.searchsorted(recording.time, recording.time[0] + (1 - 1e-9) * seconds))
     return tuple((max(a, first), b) for a, b in recording.spans if b > first)
+
+
+def check_known(recordings: Sequence["Recording"], seconds: float, least: int) -> None:
+    """Refuse a recording of which too little is left where activations are known.
+
+    Args:
+        recordings: What was measured.
+        seconds: As for `known_spans`.
+        least: Samples in a row that must be left.
+
+    Raises:
+        UserError: One has fewer.
+    """
+    for recording in recordings:
+        if not any(b - a >= least for a, b in known_spans(recording, seconds)):
+            raise UserError(
+                f"{recording.name}: the activations with which its actuators began are not "
+                f"forgotten before {seconds:.2g} s, and no {least} samples in a row follow; "
+                "record for longer, or leave it out"
+            )
 
 
 def never_forgetting(model: mujoco.MjModel) -> list[str]:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from scipy import integrate, optimize
 
-from garat_jax.diagnosis.activation import forgets_in, known_spans
+from garat_jax.diagnosis.activation import check_known, forgets_in, known_spans
 from garat_jax.diagnosis.filters import UNIFORM
 from garat_jax.diagnosis.measurements import Recording, noise
 from garat_jax.errors import UserError
@@ -147,9 +147,10 @@ def grid_for(recordings: Sequence[Recording], host: mujoco.MjModel) -> Grid:
     """Match a model to the sampling, and to its activations; see `choose_grid`.
 
     Raises:
-        UserError: Samples are too far apart to follow a motion.
+        UserError: Samples are too far apart to follow a motion, or activations stay unknown.
     """
     grid = choose_grid(recordings, host.opt.timestep)
+    check_known(recordings, forgets_in(host), SHORTEST)
     return dataclasses.replace(grid, forgets=forgets_in(host))
 
 

@@ -11,6 +11,8 @@ from garat_jax.diagnosis.activation import follow_commands, forgets_in, known_sp
 from garat_jax.diagnosis.localise import missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.oddities import oddities
+from garat_jax.diagnosis.segments import grid_for
+from garat_jax.errors import UserError
 from tests import models
 
 STEP = 0.004
@@ -85,3 +87,11 @@ def test_spans_begin_where_activations_are_known():
     split = dataclasses.replace(made, spans=((0, 100), (100, 200), (250, 500)))
     assert known_spans(split, 0.6) == ((150, 200), (250, 500))
     assert known_spans(split, 0.0) == split.spans
+
+
+def test_a_recording_that_ends_before_activations_are_known_is_refused():
+    model = mujoco.MjModel.from_xml_string(mjcf("filter"))
+    long, brief = (record("filter", 0, seconds)[0] for seconds in (3.0, 1.23))
+    assert grid_for([long], model).forgets == pytest.approx(1.2)
+    with pytest.raises(UserError, match=r"brief: .* not forgotten before 1.2 s.* leave it out"):
+        grid_for([long, dataclasses.replace(brief, name="brief")], model)
