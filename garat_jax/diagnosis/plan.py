@@ -19,7 +19,7 @@ from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
-from garat_jax.diagnosis.segments import cut, grid_for
+from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
 from garat_jax.effects.catalogue import choose_kind
@@ -225,7 +225,7 @@ class _Judge:
         rest = np.concatenate([host.qpos0, np.zeros(host.nv)])
         self._resting = np.tile(rest, (len(time), 1))
         still = self._recording(self._resting, np.zeros((len(time), host.nu)))
-        self._grid = grid_for([still], host)
+        self._grid = choose_grid([still], host.opt.timestep)  # activations are known from rest on
         self._simulator = Simulator(model, effects, self._grid)
         self._sizes = [type(e).starts(host, e.target)[0] for e in effects]
         self._places, self._hidden, self._outside = places, set(), set()

@@ -156,3 +156,16 @@ def test_what_keeps_a_plan_from_being_made_is_said(tmp_path):
     model = load_model(tmp_path / "lift.xml")
     with pytest.raises(UserError, match=r"ranges: lift leaves its range even under small commands"):
         plan(model, "coulomb_friction", "viscous_damping", seconds=4.0)
+
+
+def test_slow_actuators_are_followed_from_rest_under_the_commands_that_are_played(tmp_path):
+    path = tmp_path / "slow.xml"
+    slow = '<general dyntype="filter" dynprm="0.4" gainprm="1"'
+    path.write_text(models.PENDULUM.replace("<motor", slow))
+    model, time = load_model(path), np.arange(300) / 100
+    places = Place("viscous_damping", "joint/hinge"), Place("coulomb_friction", "joint/hinge")
+    ctrl = np.where(time < 1.0, 0.0, 2.0)[:, None]
+    followed = _Judge(model, places, time, np.asarray([[-3.0, 3.0]]))._path(ctrl)
+    assert followed.shape == (300, 2)
+    np.testing.assert_allclose(followed[:100], 0.0, atol=1e-9)
+    assert followed[110, 0] > 1e-3
