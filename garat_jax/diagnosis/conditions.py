@@ -19,7 +19,7 @@ from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import estimates
-from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.model_card import Model, save_card
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import UNEXPLAINED, Diagnosis
@@ -30,6 +30,7 @@ from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.diagnosis.view import as_effects, repaired
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect
+from garat_jax.errors import UserError
 from garat_jax.runs import RunDirectory
 
 
@@ -55,7 +56,11 @@ def diagnose_conditions(
         The selected effects' parameters are those that fit the recordings of all conditions
         together, save those in which much of the error stays unexplained; errors and candidates are
         of each condition by itself.
+
+    Raises:
+        UserError: The recordings of a condition are too short to be diagnosed.
     """
+    check_conditions(model, conditions)
     base = diagnose(model, recordings, holdout, say)
     return add_conditions(model, base, recordings, conditions, holdout, say)
 
@@ -90,9 +95,25 @@ def add_conditions(
 def read_conditions(
     model: Model, conditions: Mapping[str, Sequence[Path]] | None, columns: Path | None = None
 ) -> dict[str, tuple[Recording, ...]]:
-    """Read the recordings of each condition; see `read_recordings`."""
+    """Read the recordings of each condition; see `read_recordings` and `check_conditions`."""
     named = (conditions or {}).items()
-    return {name: tuple(read_recordings(model, paths, columns)) for name, paths in named}
+    found = {name: tuple(read_recordings(model, paths, columns)) for name, paths in named}
+    check_conditions(model, found)
+    return found
+
+
+def check_conditions(model: Model, conditions: Mapping[str, Sequence[Recording]]) -> None:
+    """Refuse recordings that cannot be diagnosed, before the base condition takes its time.
+
+    Raises:
+        UserError: A condition has none, or too short ones, or samples too far apart.
+    """
+    for name, measured in conditions.items():
+        try:
+            fitted, held_out, _ = split(checked(measured), ())
+            grid_for(thin((*fitted, *held_out)), native_model(model.compile(engine="mujoco")))
+        except UserError as error:
+            raise UserError(f"under the condition {name}: {error}") from error
 
 
 def write_cards(run: RunDirectory, model: Model, found: Diagnosis) -> None:

@@ -11,7 +11,12 @@ import plotly.graph_objects as go
 
 from garat_jax import report
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.conditions import add_conditions, read_conditions, write_cards
+from garat_jax.diagnosis.conditions import (
+    add_conditions,
+    check_conditions,
+    read_conditions,
+    write_cards,
+)
 from garat_jax.diagnosis.diagnose import diagnose, make_candidates, split, thin
 from garat_jax.diagnosis.export import copy_model, needed_files
 from garat_jax.diagnosis.findings import Candidate, Named, apart
@@ -108,7 +113,11 @@ def improve(
         say: Told what is being done.
         conditions: Recordings made under other conditions, by name; what they show besides is found
             once the model of the base condition is whole. See `diagnose_conditions`.
+
+    Raises:
+        UserError: The recordings of a condition are too short to be diagnosed.
     """
+    check_conditions(model, conditions or {})
     current, rounds = model, []
     for number in range(ROUNDS):
         found = diagnose(

@@ -13,15 +13,20 @@ from garat_jax.cli import main
 from garat_jax.diagnosis import load_model, run_diagnose
 from garat_jax.diagnosis.conditions import JointSimulator, diagnose_conditions
 from garat_jax.diagnosis.convert import write_csv
-from garat_jax.diagnosis.improve import run_improve
+from garat_jax.diagnosis.improve import improve, run_improve
 from garat_jax.diagnosis.segments import Segments
 from garat_jax.diagnosis.simulate import Simulator, Slot
 from garat_jax.effects import CATALOGUE, TorqueOffset, ViscousDamping
+from garat_jax.errors import UserError
 from garat_jax.runs import RunDirectory
 from tests import models
 from tests.diagnosis.pendulum import MODEL, add_damping, add_payload, record
 
 FEW = {kind: CATALOGUE[kind] for kind in ("viscous_damping", "torque_offset", "payload_mass")}
+
+
+def improve_under(model, recordings, conditions, say):
+    return improve(model, recordings, say=say, conditions=conditions)
 
 
 def test_damping_is_shared_and_the_pull_is_the_conditions_own():
@@ -186,3 +191,12 @@ def test_a_condition_without_a_file_is_refused(tmp_path, capsys):
         for command in ("diagnose", "improve"):
             assert main([command, str(model), str(data), "--condition", word]) == 2
             assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("find", [diagnose_conditions, improve_under])
+def test_too_short_a_condition_is_refused_before_the_base_is_diagnosed(find):
+    short = dataclasses.replace(record(add_damping, 3), name="short", spans=((0, 20),))
+    said: list[str] = []
+    with pytest.raises(UserError, match="condition warm: short is too short to hold out"):
+        find(MODEL, [record(add_damping, 0)], {"warm": [short]}, say=said.append)
+    assert not said
