@@ -6,6 +6,7 @@ trains and chirps are tried, and the best one is varied; the angle decides, and 
 effects show. One under which a joint of the model leaves its range is made smaller until none does.
 """
 
+import dataclasses
 import html
 from collections.abc import Callable
 from pathlib import Path
@@ -97,12 +98,15 @@ class Planned(NamedTuple):
 def parse_place(text: str, model: Model) -> Place:
     """Read KIND or KIND@TARGET; the target may be left out where there is only one.
 
+    Places are those of the model without its own effects, of which some add bodies.
+
     Raises:
         UserError: There is no such kind or target, or the target has to be named.
     """
     kind, _, target = text.partition("@")
     cls = choose_kind(kind, model.catalogue)
-    targets = cls.targets(model.compile(engine="mujoco").host.model)
+    bare = dataclasses.replace(model, effects=())
+    targets = cls.targets(native_model(bare.compile(engine="mujoco")))
     if not targets:
         raise UserError(f"{kind} can act nowhere in {model.path}: it needs {cls.needs}")
     if not target and len(targets) != 1:

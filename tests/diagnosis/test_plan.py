@@ -7,7 +7,7 @@ import pytest
 
 from garat_jax import cli
 from garat_jax.diagnosis import load_model
-from garat_jax.diagnosis.plan import Place, _Judge, plan
+from garat_jax.diagnosis.plan import Place, _Judge, parse_place, plan
 from garat_jax.errors import UserError
 from tests import models
 
@@ -169,3 +169,13 @@ def test_slow_actuators_are_followed_from_rest_under_the_commands_that_are_playe
     assert followed.shape == (300, 2)
     np.testing.assert_allclose(followed[:100], 0.0, atol=1e-9)
     assert followed[110, 0] > 1e-3
+
+
+def test_a_body_that_an_effect_of_the_card_adds_is_no_place(pendulum):
+    card = pendulum.with_suffix(".toml")
+    payload = 'kind = "payload_mass"\ntarget = "body/pole"\nparameters = { mass = 0.2 }\n'
+    card.write_text(f'format = "garat-model/1"\nmjcf = "{pendulum.name}"\n[[effect]]\n{payload}')
+    model = load_model(card)
+    assert parse_place("com_offset", model) == Place("com_offset", "body/pole")
+    with pytest.raises(UserError, match="unknown target of com_offset"):
+        parse_place("com_offset@body/payload of pole", model)
