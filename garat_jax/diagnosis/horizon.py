@@ -211,7 +211,7 @@ def _predictable(
     for horizon in _possible([recordings[number] for number in chosen]):
         segments = cut(recordings, grid, horizon)
         segments = segments.take(np.isin(segments.recording, chosen))
-        if segments.measured.shape[1] <= problem.segments.measured.shape[1]:
+        if segments.seconds < (1 + 1e-9) * problem.horizon:
             break
         growth = _growth(_perturbed(problem.simulator, theta, segments), segments)
         growth = _lasting(growth, segments.place, int(segments.place.max()) + 1)

@@ -91,7 +91,7 @@ class Problem(Generic[AnySimulator]):
     @property
     def horizon(self) -> float:
         """Seconds of a segment."""
-        return self.segments.measured.shape[1] * self.interval
+        return self.segments.seconds
 
     @property
     def num_fitted(self) -> int:

@@ -68,6 +68,7 @@ class Segments:
         start_unit: What the initial states differ by, a unit of each component, [nq + nv].
         lasts: Simulated steps that a segment lasts, if it is not of a recording that has too few
             samples in them, or is shorter.
+        seconds: Seconds that the longest lasts.
     """
 
     measured: np.ndarray
@@ -87,6 +88,7 @@ class Segments:
     spread: np.ndarray
     start_unit: np.ndarray
     lasts: float = np.inf
+    seconds: float = np.nan
 
     @property
     def is_whole(self) -> np.ndarray:
@@ -250,6 +252,7 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
         spread=np.maximum(spread, QUIET * deviations),
         start_unit=_unit(start),
         lasts=horizon / grid.interval,
+        seconds=max((b - a) * samples[i] for i, a, b in pieces),
     )
 
 

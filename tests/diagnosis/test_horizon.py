@@ -14,7 +14,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.report import diagnosis_lead
 from garat_jax.diagnosis.results import Errors
-from garat_jax.diagnosis.segments import choose_grid
+from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.velocity import estimate_velocity
@@ -272,3 +272,21 @@ def test_a_height_that_hardly_moves_does_not_shorten_segments():
         qvel=noisy[:, 2:] + [0, 1] * heights[:, 1:],
     )
     assert choose_horizon(simulator, [lifted], grid)[0] == 0.2
+
+
+def test_segments_last_as_long_as_those_of_a_slow_recording_beside_a_short_fast_one():
+    slow = [every(record_weak(0.0)[seed], 5) for seed in range(3)]
+    fast = dataclasses.replace(record_weak(0.0)[3], spans=((0, 100),))  # 0.4 s
+    recordings = [*slow, fast]
+    grid = choose_grid(recordings, 0.002)
+    simulator = Simulator(MODEL, (MotorGain("actuator/motor"),), grid)
+    segments = cut(recordings, grid, 0.5)
+    problem = Problem(simulator, segments, segments.recording > 0, grid.sample)
+    assert problem.horizon == pytest.approx(0.5)
+    longest = cut_longest(problem, recordings, grid, np.asarray([GAIN]))
+    assert longest and longest.horizon == pytest.approx(2.0)
+
+
+def every(recording: Recording, step: int) -> Recording:
+    parts = {name: getattr(recording, name)[::step] for name in ("time", "qpos", "qvel", "ctrl")}
+    return dataclasses.replace(recording, **parts, spans=((0, len(parts["time"])),))
