@@ -23,7 +23,8 @@ FOLLOWING = (
     int(mujoco.mjtDyn.mjDYN_FILTEREXACT),
     int(mujoco.mjtDyn.mjDYN_MUSCLE),
 )
-"""Dynamics whose activation comes to be the command; the first parameter is a time constant."""
+"""Dynamics whose activation comes to be the command; the first parameter is a time constant, and
+of muscles, which let go more slowly than they pull, the second one is, too."""
 NO_MOTION = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_GRAVITY)
 """What is left out where only activations change."""
 TIME_CONSTANTS = 3.0
@@ -38,7 +39,9 @@ def forgets_in(model: mujoco.MjModel) -> float:
     Integrators, which never forget, do not count.
     """
     follows = np.isin(model.actuator_dyntype, FOLLOWING)
-    slowest = float(np.max(model.actuator_dynprm[follows, 0], initial=0.0))
+    lets_go = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE
+    constants = [*model.actuator_dynprm[follows, 0], *model.actuator_dynprm[lets_go, 1]]
+    slowest = float(np.max(constants, initial=0.0))
     return min(LONGEST, TIME_CONSTANTS * slowest)
 
 

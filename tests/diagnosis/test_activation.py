@@ -1,6 +1,7 @@
 """Activations follow the recorded commands; what a model is not told of them is said."""
 
 import dataclasses
+import re
 
 import mujoco
 import numpy as np
@@ -87,6 +88,12 @@ def test_spans_begin_where_activations_are_known():
     split = dataclasses.replace(made, spans=((0, 100), (100, 200), (250, 500)))
     assert known_spans(split, 0.6) == ((150, 200), (250, 500))
     assert known_spans(split, 0.0) == split.spans
+
+
+def test_a_muscle_forgets_as_slowly_as_it_lets_go():
+    slow = '<muscle timeconst="0.01 0.4" lengthrange="-1 1" name="motor" joint="hinge"/>'
+    mjcf_of_motor = re.sub("<motor.*/>", slow, models.PENDULUM)
+    assert forgets_in(mujoco.MjModel.from_xml_string(mjcf_of_motor)) == pytest.approx(1.2)
 
 
 def test_a_recording_that_ends_before_activations_are_known_is_refused():
