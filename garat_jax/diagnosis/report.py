@@ -270,7 +270,8 @@ def traces(view: View) -> Section:
     index = int(before.segments.recording[order[0]])
     recording = view.recordings[index]
     worst = [s for s in order if before.segments.recording[s] == index][:NUM_WORST]
-    sizes = [size.relative for size in before.sizes().values()]
+    measured = before.only([index]).names  # what was estimated is no proof
+    sizes = [size.relative for size in before.sizes().values()][: len(measured)]
     chosen = sorted(np.argsort(sizes)[::-1][:NUM_SIGNALS])
     seconds = before.horizon
     segments = f"{len(worst)} segments" if len(worst) > 1 else "segment"

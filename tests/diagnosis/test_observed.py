@@ -9,8 +9,10 @@ from garat_jax.diagnosis.compare import compare
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.replay import as_recordings, replay
+from garat_jax.diagnosis.report import traces
 from garat_jax.diagnosis.segments import choose_grid, cut, signal_noise
 from garat_jax.diagnosis.velocity import estimate_velocity
+from garat_jax.diagnosis.view import look
 from tests.diagnosis.pendulum import MODEL, add_damping, record
 
 HOST = MODEL.compile(engine="mujoco").host.model
@@ -82,3 +84,11 @@ def test_a_replay_of_recordings_without_velocity_shows_none(mixed):
         (shown,) = replay(MODEL, mixed, {0.5: chosen})
         assert shown.names == names
         assert np.isfinite(shown.error())
+
+
+def test_estimated_velocities_are_not_drawn_as_measured(measured):
+    worse = without_velocity(record(lambda spec: add_damping(spec, 0.2), 3))
+    drawn = traces(look(MODEL, [measured[0], worse], [0, 1]))
+    assert worse.name in drawn.text
+    assert [figure.title for figure in drawn.figures] == ["qpos.hinge"]
+    assert len(traces(look(MODEL, [*measured, worse], [0, 1])).figures) == 2
