@@ -162,6 +162,11 @@ class Sighting:
     horizon: float
 
     @property
+    def is_sized(self) -> bool:
+        """Whether this recording by itself tells the parameter, within an interval."""
+        return all(map(math.isfinite, (self.estimate, self.low, self.high)))
+
+    @property
     def is_needed(self) -> bool:
         """Whether the effect is what this recording by itself would have asked for first."""
         return self.error_with < self.error_without and not self.ahead

@@ -195,7 +195,7 @@ def _summaries(sightings: Mapping[_Parameter, list[Sighting]]) -> tuple[Repeated
 
 
 def _summary(parameter: _Parameter, seen: list[Sighting]) -> Repeated:
-    usable = [s for s in seen if np.isfinite([s.estimate, s.low, s.high]).all() and s.low < s.high]
+    usable = [s for s in seen if s.is_sized and s.low < s.high]
     sizes = np.asarray([s.estimate for s in usable])
     errors = np.asarray([(s.high - s.low) / 3.92 for s in usable])
     p_value = 1.0

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import plotly.graph_objects as go
 
-from garat_jax.diagnosis.figures import words
+from garat_jax.diagnosis.figures import label, words
 from garat_jax.diagnosis.findings import Drift, Named, Repeated, Unseen
 from garat_jax.diagnosis.quality import Quality
 from garat_jax.diagnosis.residuals import Residuals
@@ -171,7 +171,7 @@ def repeatability_section(diagnosis: Diagnosis) -> list[Section]:
             + (f" [{r.unit}]" if r.unit not in ("", "1") else ""),
             s.recording,
             s.estimate,
-            f"{s.low:.4g} to {s.high:.4g}" if np.isfinite(s.estimate) else "–",
+            f"{s.low:.4g} to {s.high:.4g}" if s.is_sized else "–",
             100 * s.error_without,
             100 * s.error_with,
             _words(s.ahead) or "none",
@@ -183,7 +183,9 @@ def repeatability_section(diagnosis: Diagnosis) -> list[Section]:
     lines = [_need(r, where) for (_, _, where), r in needs.items()]
     for r, where in found:
         name = f"{r.parameter} of {r.effect.replace('_', ' ')} at {r.target}{where}"
-        if r.agree:
+        if sum(s.is_sized for s in r.recordings) < 2:
+            lines.append(f"- {name}: no two recordings tell its size, so none can be compared.")
+        elif r.agree:
             lines.append(f"- {name}: the recordings agree within their intervals.")
         else:
             lines.append(
@@ -219,7 +221,7 @@ def _need(repeated: Repeated, where: str) -> str:
 
 
 def _words(named: Sequence[Named]) -> str:
-    return ", ".join(str(n).replace("_", " ") for n in named)
+    return ", ".join(map(label, named))
 
 
 def drift_section(drifts: Sequence[Drift]) -> list[Section]:
@@ -280,7 +282,7 @@ def conditions_section(diagnosis: Diagnosis) -> list[Section]:
     found = [("all", c) for c in diagnosis.selected]
     found += [(name, c) for name, other in diagnosis.conditions.items() for c in other.selected]
     rows = [
-        (name, str(c.named).replace("_", " "), parameter, e.estimate, e.low, e.high, e.unit)
+        (name, label(c), parameter, e.estimate, e.low, e.high, e.unit)
         for name, c in found
         for parameter, e in c.parameters.items()
     ]
