@@ -27,6 +27,7 @@ from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.own_effects import everywhere
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
@@ -195,16 +196,18 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
 
     Places are those of the model without its own effects, of which some add bodies. With one
     actuator, `all` is that actuator.
+
+    Raises:
+        UserError: One of a user's own fails; see `everywhere`.
     """
     host = dataclasses.replace(model, effects=()).compile(engine="mujoco").host.model
     present = {(effect.kind, effect.target) for effect in model.effects}
     candidates = []
     for kind, cls in model.catalogue.items():
-        for target in cls.targets(host):
-            alone = target == "all" and "actuator" in cls.elements and host.nu < 2
-            if alone or (kind, target) in present:
-                continue
-            candidates.append(cls(target=target, **cls.at(host, target)))
+        for effect in everywhere(cls, host):
+            alone = effect.target == "all" and "actuator" in cls.elements and host.nu < 2
+            if not alone and (kind, effect.target) not in present:
+                candidates.append(effect)
     return tuple(candidates)
 
 

@@ -17,7 +17,7 @@ from garat_jax.effects import CATALOGUE, Effect
 from garat_jax.effects.base import ModelView
 from garat_jax.effects.catalogue import line_in
 from garat_jax.engine import HostModel
-from garat_jax.errors import UserError, nearest
+from garat_jax.errors import UserError, nearest, unknown_name
 from garat_jax.overrides import Override
 
 CLOSE = 1e-5
@@ -31,6 +31,26 @@ def is_own(effect: Effect) -> bool:
     return type(effect) is not CATALOGUE.get(effect.kind)
 
 
+def everywhere(cls: type[Effect], host: mujoco.MjModel) -> list[Effect]:
+    """Make a kind of effect at every place of a model, each without effect.
+
+    Args:
+        cls: The kind.
+        host: The compiled model.
+
+    Raises:
+        UserError: It is a user's own, and fails at that or at telling sizes to try.
+    """
+    made: list[Effect] = []
+    is_built_in = cls is CATALOGUE.get(cls.kind)
+    with contextlib.nullcontext() if is_built_in else _named(cls):
+        for target in cls.targets(host):
+            made.append(cls(target=target, **cls.at(host, target)))
+            if not is_built_in:
+                _check_starts(made[-1], host)
+    return made
+
+
 def try_own(
     spec: mujoco.MjSpec, overrides: tuple[Override, ...], effects: Sequence[Effect]
 ) -> None:
@@ -40,7 +60,7 @@ def try_own(
 
     Raises:
         UserError: One fails, in whatever way, returns what is of another shape than it should be,
-            or changes something without effect.
+            changes something without effect, or tells no sizes at which to try it.
     """
     for effect in filter(is_own, effects):
         with _named(effect):
@@ -48,6 +68,7 @@ def try_own(
                 alone = compile(spec, overrides, (effect,), "mujoco")
             except UserError:
                 continue  # it may need another effect; compiling all of them says what is amiss
+            _check_starts(effect, alone.host.model)
             # Functions of their own: JAX would take a law that was read anew for the one before.
             jax.eval_shape(lambda world: _check_shapes(world), alone)
             jax.eval_shape(lambda world: _one_step(world), alone)
@@ -124,6 +145,20 @@ def _done_by(dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Arr
         },
         "sense": {"qpos": (sensed.qpos, state.qpos), "qvel": (sensed.qvel, state.qvel)},
     }
+
+
+def _check_starts(effect: Effect, host: mujoco.MjModel) -> None:
+    """Refuse sizes to try an effect at that are none, or of parameters that it has not."""
+    known = [p.name for p in effect.parameters()]
+    if not known:
+        return
+    sizes = effect.starts(host, effect.target)
+    if not sizes or not all(sizes):
+        raise _mistake(effect, "starts", "starts lists no size at which to try it")
+    for name in {name: None for size in sizes for name in size}:
+        if name not in known:
+            what = str(unknown_name("parameter", name, known))
+            raise _mistake(effect, "starts", f"starts has an {what}")
 
 
 def _check_shapes(dynamics: Dynamics) -> None:
@@ -211,8 +246,8 @@ def _command_range(host: mujoco.MjModel) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _named(effect: Effect) -> Iterator[None]:
-    """Make whatever fails within an effect one line that names it."""
+def _named(effect: Effect | type[Effect]) -> Iterator[None]:
+    """Make whatever fails within an effect, or a kind of effect, one line that names it."""
     try:
         yield
     except UserError:
@@ -232,13 +267,13 @@ def _mistake(effect: Effect, method: str, what: str) -> UserError:
     return UserError(_told(effect, where, what))
 
 
-def _told(effect: Effect, where: str, what: str) -> str:
+def _told(effect: Effect | type[Effect], where: str, what: str) -> str:
     return f"effect {effect.kind}{f' ({where})' if _file_of(effect) else ''}: {what}"
 
 
-def _file_of(effect: Effect) -> str:
+def _file_of(effect: Effect | type[Effect]) -> str:
     """Return the file of an effect; empty if it was written in a notebook."""
     try:
-        return inspect.getfile(type(effect))
+        return inspect.getfile(effect if isinstance(effect, type) else type(effect))
     except (OSError, TypeError):
         return ""

@@ -184,6 +184,26 @@ def test_what_fields_returns_is_checked(mine, old, new, said):
     assert f"({mine} line 21): " in str(caught.value) and said in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("method", "body", "said"),
+    [
+        ("starts(cls, host, target)", "return ()", "line 25): starts lists no size"),
+        ("starts(cls, host, target)", "return ({'stifness': 1.0},)", "did you mean stiffness"),
+        ("starts(cls, host, target)", "return 1 / 0", "line 27): ZeroDivisionError"),
+        ("at(cls, host, target)", "return {'stifness': 0.0}", "unexpected keyword argument"),
+        ("fits(cls, host, element, name)", "return host.name", "line 27): AttributeError"),
+    ],
+)
+def test_what_tells_places_and_sizes_is_checked_before_a_diagnosis(mine, method, body, said):
+    mine.write_text(f"{MINE}\n    @classmethod\n    def {method}:\n        {body}\n")
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    with pytest.raises(UserError) as caught:
+        make_candidates(model)
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(f"effect my_spring ({mine}")
+    assert said in line
+
+
 @pytest.mark.parametrize("kind", CATALOGUE)
 def test_the_catalogue_passes_for_a_users_own(kind):
     spec = models.spec(models.SLIDER if kind.startswith("contact") else models.ARM)
