@@ -57,8 +57,8 @@ class Add:
             mjcf_in_card(self.out, model)
             recordings = read_recordings(model, self.fit, self.map)
             done = add(model, self.effect, self.at, values, recordings, tell)
-            say(str(done))
             save_card(self.out, done.model)
+            say(str(done))
             say(f"model card: {self.out}")
 
 

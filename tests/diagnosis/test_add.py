@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from garat_jax import cli
+from garat_jax.commands import models as commands
 from garat_jax.diagnosis import load_model
 from garat_jax.diagnosis.add import Sized
 from garat_jax.diagnosis.hidden import make_recordings
@@ -192,3 +193,13 @@ def test_what_is_not_set_keeps_what_the_model_has(tmp_path):
     (effect,) = load_model(out).effects
     assert float(effect.time_constant) == 0.05
     assert float(effect.damping_ratio) == pytest.approx(0.4)
+
+
+def test_the_card_is_written_before_anything_is_said_of_it(pendulum, monkeypatch):
+    def fail(message):
+        raise BrokenPipeError(message)
+
+    monkeypatch.setattr(commands, "say", fail)
+    with pytest.raises(BrokenPipeError):
+        add(pendulum, "viscous_damping", "--at", "joint/hinge", "--set", "coefficient=0.1")
+    assert load_model(pendulum.parent / "new.toml").effects
