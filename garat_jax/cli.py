@@ -7,6 +7,7 @@ once.
 
 import dataclasses
 import inspect
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -170,6 +171,8 @@ COMMANDS: dict[str, type[Command]] = {
 
 def entry() -> NoReturn:
     """Run `garat` as the process that this is."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # what its encoding lacks is escaped, as on stderr
+        sys.stdout.reconfigure(errors="backslashreplace")
     status = main()
     if status == INTERRUPTED:  # XLA's threads may still call Python, which would no longer be there
         sys.stdout.flush()

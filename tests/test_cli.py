@@ -18,6 +18,13 @@ def garat(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*program, *arguments], capture_output=True, text=True, timeout=120)
 
 
+def test_letters_that_the_output_has_no_code_for_are_escaped(monkeypatch):
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    done = garat("effects", "viscous_damping")
+    assert done.returncode == 0, done
+    assert r"\u03c4" in done.stdout
+
+
 def assert_refused(done: subprocess.CompletedProcess[str], *parts: str) -> None:
     assert done.returncode == 2, done
     assert done.stdout == ""
