@@ -112,6 +112,11 @@ def test_version():
             ["diagnose", __file__, __file__, "--condition", f"loaded={__file__}"],
             ["test_cli.py is given twice"],
         ),
+        (["compare", __file__, __file__, __file__], ["test_cli.py is given twice"]),
+        (
+            ["add", __file__, "x", "--at", "y", "--fit", __file__, __file__, "--out", "never.toml"],
+            ["test_cli.py is given twice"],
+        ),
         (["demo", "--seed", "-1", "--out", "never"], ["--seed -1: expected 0 to 2147483647"]),
         (["demo", "--seed", "2147483648", "--out", "never"], ["expected 0 to 2147483647"]),
         (["compare", 300 * "n" + ".xml", "no.csv"], ["n.xml: File name too long"]),

@@ -114,6 +114,15 @@ def check_files(paths: Sequence[Path], what: str) -> None:
             raise UserError(f"{what}: there is no file {path}")
 
 
+def check_once(paths: Sequence[Path]) -> None:
+    """Refuse a recording that is given twice: it would count as evidence twice."""
+    seen = set[Path]()
+    for path in paths:
+        if path.resolve() in seen:
+            raise UserError(f"{path} is given twice; expected each recording once")
+        seen.add(path.resolve())
+
+
 def check_optional(path: Path | None, option: str) -> None:
     """Refuse a file that is named and not there."""
     if path is not None:

@@ -9,7 +9,14 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from garat_jax.commandline import arg
-from garat_jax.commands.console import check_files, check_optional, make_run, say, writing
+from garat_jax.commands.console import (
+    check_files,
+    check_once,
+    check_optional,
+    make_run,
+    say,
+    writing,
+)
 from garat_jax.errors import UserError, choose
 
 
@@ -31,14 +38,19 @@ class OnRecordings:
     """Replace an earlier run in DIR."""
 
     def check(self) -> None:
-        """Refuse files that are not there.
+        """Refuse files that are not there, and recordings that are given twice.
 
         Raises:
-            UserError: One is not.
+            UserError: A file is missing, or a recording is there twice.
         """
         check_files([self.model], "MODEL")
         check_files(self.data, "DATA")
         check_optional(self.map, "--map")
+        check_once(self.recordings())
+
+    def recordings(self) -> list[Path]:
+        """List all recordings."""
+        return list(self.data)
 
     def folder(self, command: str) -> Path:
         """Return where the results go."""
@@ -56,13 +68,6 @@ class WithHoldout(OnRecordings):
         """Refuse files that are not there, and proof on what was fitted."""
         super().check()
         check_files(self.holdout or self.data, "--holdout")
-        seen = set[Path]()
-        for path in self.recordings():
-            if path.resolve() in seen:
-                raise UserError(
-                    f"{path} is given twice; a recording is either fitted or held out, once"
-                )
-            seen.add(path.resolve())
 
     def recordings(self) -> list[Path]:
         """List all recordings."""

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from garat_jax.commandline import arg
-from garat_jax.commands.console import check_files, check_optional, print_table, say, writing
+from garat_jax.commands.console import (
+    check_files,
+    check_once,
+    check_optional,
+    print_table,
+    say,
+    writing,
+)
 from garat_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -43,6 +50,7 @@ class Add:
         """Write the card; with recordings, fit the effect first."""
         check_files([self.model], "MODEL")
         check_files(self.fit or [self.model], "--fit")
+        check_once(self.fit)
         check_optional(self.map, "--map")
         values = _assignments(self.set)
         with writing(self.out, ".toml", self.force):
