@@ -6,6 +6,7 @@ once.
 """
 
 import dataclasses
+import errno
 import inspect
 import io
 import os
@@ -28,6 +29,8 @@ from garat_jax.interrupt import interruptible
 DESCRIPTION = "Ground a simulator in data, and find the physical effect that it is missing."
 
 DONE, FAILED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What a full disk, or a quota that is used up, says when something is written, naming no file."""
 
 
 class Command(Protocol):
@@ -188,8 +191,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command line without the program's name; that of the process if None.
 
     Returns:
-        0 done, 1 a computation diverged, 2 the user's input is wrong, 130 interrupted by Ctrl-C
-        or SIGTERM. Anything else is a fault of the program and leaves as an exception.
+        0 done, 1 a computation diverged, 2 the user's input is wrong or a disk full,
+        130 interrupted by Ctrl-C or SIGTERM. Anything else is a fault of the program and leaves as
+        an exception.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     compilation_cache.enable()
@@ -209,9 +213,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         return complain(f"error: {error}", USER_ERROR)
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None and error.errno not in FULL:
             raise
-        return complain(f"error: {error.filename}: {error.strerror}", USER_ERROR)
+        where = f"{error.filename}: " if error.filename else ""
+        return complain(f"error: {where}{error.strerror}", USER_ERROR)
     except (AssertionError, RuntimeError) as error:
         from garat_jax.devices import describe, is_of_devices
 

@@ -1,4 +1,5 @@
 import dataclasses
+import errno
 import subprocess
 import sys
 from pathlib import Path
@@ -141,6 +142,7 @@ class Failing:
         failures = {
             "user": UserError("expected an apple,\n got a pear"),
             "interrupt": KeyboardInterrupt(),
+            "full": OSError(errno.ENOSPC, "No space left on device"),
             "diverged": DivergedError("step 3, seed 1: the loss is NaN"),
         }
         if self.how == "library":
@@ -156,6 +158,11 @@ def failing(monkeypatch):
 def test_an_error_is_one_line(failing, capsys):
     assert cli.main(["fail"]) == 2
     assert capsys.readouterr().err == "garat: error: expected an apple, got a pear\n"
+
+
+def test_a_full_disk_is_one_line(failing, capsys):
+    assert cli.main(["fail", "--how", "full"]) == 2
+    assert capsys.readouterr().err == "garat: error: No space left on device\n"
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(failing):
