@@ -30,6 +30,8 @@ from garat_jax.report import styled
 
 RATE = 100.0
 """Commands a second."""
+SHORTEST, LONGEST = 2.0, 600.0
+"""Seconds that an excitation may last."""
 HORIZON = 1.0
 """Seconds of a segment, whose initial state is free."""
 TRIALS = 12
@@ -130,14 +132,16 @@ def plan(
         model: The model.
         first: One effect, or its name as `parse_place` reads it.
         second: The other.
-        seconds: Length of the excitation.
+        seconds: Length of the excitation, 2 to 600.
         seed: Draws the excitations; 0 or more.
         say: Told what is being done.
 
     Raises:
         UserError: The model has no actuators or one without limits, an effect is unknown, they are
-            the same, or one shows in nothing, or the seed is negative.
+            the same, or one shows in nothing, or the length or the seed is out of range.
     """
+    if not SHORTEST <= seconds <= LONGEST:
+        raise UserError(f"seconds {seconds:g}: expected {SHORTEST:g} to {LONGEST:g}")
     if seed < 0:
         raise UserError(f"seed {seed}: expected 0 or more")
     first, second = (parse_place(p, model) if isinstance(p, str) else p for p in (first, second))

@@ -42,6 +42,12 @@ def test_the_same_seed_plans_the_same(pendulum):
     assert first.after <= first.before
 
 
+@pytest.mark.parametrize("seconds", [np.nan, 0.0, 601.0])
+def test_a_length_out_of_range_is_refused_in_python_too(pendulum, seconds):
+    with pytest.raises(UserError, match="expected 2 to 600"):
+        plan(load_model(pendulum), "viscous_damping", "coulomb_friction", seconds)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
