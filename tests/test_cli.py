@@ -120,6 +120,14 @@ def test_version():
         ),
         (["demo", "--seed", "-1", "--out", "never"], ["--seed -1: expected 0 to 2147483647"]),
         (["demo", "--seed", "2147483648", "--out", "never"], ["expected 0 to 2147483647"]),
+        (
+            ["transfer", "inverted_pendulum_heavy", "--seeds", "10000000000000", "--out", "never"],
+            ["--seed 9999999999999: expected 0 to 2147483647"],
+        ),
+        (
+            ["effects", "viscous_dampin"],
+            ["did you mean viscous_damping? (--effects FILE.py adds others)"],
+        ),
         (["compare", 300 * "n" + ".xml", "no.csv"], ["n.xml: File name too long"]),
         (["transfer", "hopper_heavy", "--out", 300 * "n"], ["nn: File name too long"]),
         (["demo", "--measurements", "nowhere"], ["--measurements", "no folder nowhere"]),

@@ -57,7 +57,7 @@ def make_run(
     Args:
         command: A command with a field `force`.
         out: The folder.
-        seeds: The seeds of the run.
+        seeds: The seeds of the run, one after the other.
         resume: Go on with the run that the folder holds; None if the command cannot.
 
     Raises:
@@ -65,7 +65,7 @@ def make_run(
     """
     from garat_jax.runs import RunDirectory, earlier_run_kept, put_back_earlier
 
-    for seed in seeds:
+    for seed in (*seeds[:1], *seeds[-1:]):
         if not 0 <= seed <= LARGEST_SEED:
             raise UserError(f"--seed {seed}: expected 0 to {LARGEST_SEED}")
     config = {

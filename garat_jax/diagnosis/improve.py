@@ -17,7 +17,8 @@ from garat_jax.diagnosis.conditions import (
     read_conditions,
     write_cards,
 )
-from garat_jax.diagnosis.diagnose import diagnose, make_candidates, split, thin
+from garat_jax.diagnosis.diagnose import diagnose, few_segments, make_candidates, split, thin
+from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.export import copy_model, needed_files
 from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.held_out import are_explained, errors_of, longest_errors
@@ -33,6 +34,7 @@ from garat_jax.diagnosis.report_conditions import condition_sections
 from garat_jax.diagnosis.results import Diagnosis, Rung, Verdict
 from garat_jax.diagnosis.segments import grid_for
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.view import repaired
 from garat_jax.effects.catalogue import Catalogue
@@ -144,7 +146,7 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     first, last = rounds[0], rounds[-1]
     if not added:
         return first
-    ladder, error, longest = _ladder(model, recordings, holdout, added)
+    ladder, error, longest, drifts = _ladder(model, recordings, holdout, added)
     stays = last.verdict == "unexplained" and not are_explained(error, longest)
     verdict: Verdict = "unexplained" if stays else "missing_effect"
     return dataclasses.replace(
@@ -154,6 +156,7 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
         longest=longest,
         selected=apart(added),
         ladder=ladder,
+        drifts=drifts,
         left=last.left if stays else (),
         next_experiment=last.next_experiment or first.next_experiment,
     )
@@ -164,7 +167,7 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
 
     Returns:
         A rung for each effect, at its final size; the errors at this horizon, and those over the
-        longest segments, as `longest_errors` has them.
+        longest segments, as `longest_errors` has them; and which of the sizes drift.
     """
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
@@ -189,7 +192,17 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     )
     host, floor = simulator.host, noise_floor(problem, metric, fits[-1])
     error = errors_of(problem, (fits[0], fits[-1]), floor, host, how)
-    return rungs, error, longest_errors(problem, final, everything, grid, host, how)
+    longest = longest_errors(problem, final, everything, grid, host, how)
+    if few_segments(problem):
+        return rungs, error, longest, ()
+    told = tuple(
+        j
+        for number, candidate in enumerate(added)
+        for name, j in columns_of(simulator.slots, number).items()
+        if (size := candidate.parameters.get(name)) and np.isfinite(size.high - size.low)
+    )
+    whole = dataclasses.replace(fits[-1], free=told)
+    return rungs, error, longest, find_drifts(problem, whole, everything)
 
 
 def run_improve(

@@ -360,6 +360,8 @@ class Diagnosis:
         lines, shared = [], [c.named for c in self.selected]
         for name, found in self.conditions.items():
             lines.append(f"Under the condition {name}, with the above: {found.sentence}")
+            own = [warning for warning in found.warnings if warning not in self.warnings]
+            lines += [f"  warning: {warning}" for warning in own]
             for c in found.selected:
                 instead = " (instead of the shared one)" if c.named in shared else ""
                 lines.append(f"  {c.named}{instead}: {c.sizes}")

@@ -58,7 +58,7 @@ def choose_kind(kind: str, catalogue: Catalogue) -> type[Effect]:
     try:
         return choose("effect", kind, catalogue)
     except UserError as error:
-        raise UserError(f"{error}; --effects FILE.py adds others") from None
+        raise UserError(f"{error} (--effects FILE.py adds others)") from None
 
 
 def run_python(path: Path, option: str) -> ModuleType:

@@ -44,6 +44,9 @@ def test_damping_is_shared_and_the_pull_is_the_conditions_own():
     assert content["selected"][0]["effect"] == "torque_offset"
     assert content["conditions"] == {}
     assert "Under the condition with cable, with the above: Missing: torque_offset" in str(found)
+    cable = dataclasses.replace(found.conditions["with cable"], warnings=("it was cold",))
+    warned = dataclasses.replace(found, conditions={"with cable": cable})
+    assert "  warning: it was cold" in warned.other_conditions
 
 
 def test_a_shared_effect_may_be_weaker_under_a_condition():

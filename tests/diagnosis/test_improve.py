@@ -1,5 +1,6 @@
 """`garat improve`: a hidden effect ends up in a model card that loads, and the error falls."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -7,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from garat_jax.diagnosis import load_model
+from garat_jax.diagnosis.compare import read_recordings
+from garat_jax.diagnosis.findings import Drift, Estimate
 from garat_jax.diagnosis.hidden import make_recordings
-from garat_jax.diagnosis.improve import run_improve
+from garat_jax.diagnosis.improve import _as_one, run_improve
 from garat_jax.effects import CATALOGUE
 from garat_jax.runs import RunDirectory
 from tests import models
@@ -53,6 +56,18 @@ def test_the_ladder_falls_to_the_floor(improved):
     assert content["verdict"] == "missing_effect"
     assert [r["verdict"] for r in content["rounds"]] == ["missing_effect", "adequate"]
     assert "+ coulomb_friction at joint/hinge (torque 0.07" in str(done)
+
+
+def test_a_drift_that_the_later_rounds_explain_is_not_said(improved):
+    """What drifts is found beside all effects that were added, not beside those of one round."""
+    made, _, done = improved
+    change = Estimate(0.1, 0.05, 0.15, "N m")
+    drift = Drift("coulomb_friction", "joint/hinge", "torque", 0.1, 0.2, change, 0.001, 0.5)
+    first, last = done.rounds
+    rounds = [dataclasses.replace(first, drifts=(drift,)), last]
+    model = load_model(made.fit[0].parent.parent / "pendulum.xml", FEW)
+    recordings = read_recordings(model, (*made.fit, *made.holdout))
+    assert _as_one(model, recordings, (), rounds, first.selected).drifts == ()
 
 
 def test_each_recording_alone_shows_the_same_size(improved):
