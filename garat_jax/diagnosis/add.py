@@ -143,7 +143,7 @@ def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, flo
 
     Raises:
         UserError: The kind, the target or a parameter is unknown, a value is outside its bounds,
-            the model has this effect already, or a user's own law fails; see `try_own`.
+            the model has what excludes it already, or a user's own law fails; see `try_own`.
     """
     cls = choose_kind(kind, model.catalogue)
     effect = make_effect(cls, target, values)
@@ -153,8 +153,10 @@ def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, flo
     effect = effect.replace(**{**cls.at(host, target), **values})
     check_bounds(effect, host)
     try_own(model.spec, model.overrides, (effect,))
-    if (kind, target) in [(e.kind, e.target) for e in model.effects]:
-        raise UserError(f"{model.path} has {kind} at {target} already; change it there")
+    for present in model.effects:
+        if effect.excludes(present):
+            do = "change it" if present.kind == kind else f"it is that or {kind}"
+            raise UserError(f"{model.path} has {present.kind} at {target} already; {do} there")
     return effect
 
 

@@ -201,12 +201,11 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
         UserError: One of a user's own fails; see `everywhere`.
     """
     host = dataclasses.replace(model, effects=()).compile(engine="mujoco").host.model
-    present = {(effect.kind, effect.target) for effect in model.effects}
     candidates = []
-    for kind, cls in model.catalogue.items():
+    for cls in model.catalogue.values():
         for effect in everywhere(cls, host):
             alone = effect.target == "all" and "actuator" in cls.elements and host.nu < 2
-            if not alone and (kind, effect.target) not in present:
+            if not alone and not any(effect.excludes(present) for present in model.effects):
                 candidates.append(effect)
     return tuple(candidates)
 

@@ -140,14 +140,25 @@ def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
         overrides = tuple(_override(table) for table in _tables(card, "override"))
         effects = tuple(_effect(table, catalogue) for table in _tables(card, "effect"))
         host = compile(spec, overrides, engine="mujoco").host.model
-        for effect in effects:
-            if sum((e.kind, e.target) == (effect.kind, effect.target) for e in effects) > 1:
-                raise UserError(f"{effect.kind} is at {effect.target} twice; write it once")
+        for number, effect in enumerate(effects):
+            for other in effects[:number]:
+                _check_both(effect, other)
             effect.check(host)
             check_bounds(effect, host)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     return Model(path.stem, path, mjcf, spec, overrides, effects, catalogue)
+
+
+def _check_both(effect: Effect, other: Effect) -> None:
+    """Check that a card may have both of two effects."""
+    if not effect.excludes(other):
+        return
+    if effect.kind == other.kind:
+        raise UserError(f"{effect.kind} is at {effect.target} twice; write it once")
+    raise UserError(
+        f"{other.kind} and {effect.kind} are both at {effect.target}, where one of them can be only"
+    )
 
 
 def save_card(path: str | Path, model: Model, extra_effects: Sequence[Effect] = ()) -> Path:

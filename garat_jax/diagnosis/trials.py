@@ -54,8 +54,9 @@ class Trial(NamedTuple):
 def firsts(problem: Problem[Simulator], theta: np.ndarray, skip) -> tuple[list[Row], list[Trial]]:
     """List each candidate at each of its sizes, a row for each.
 
-    Where one size of one parameter is all that a law lists, and its parameters act alone, each of
-    them has a trial: any may be the one that the recordings show.
+    Those that what is skipped excludes are none. Where one size of one parameter is all that a law
+    lists, and its parameters act alone, each of them has a trial: any may be the one that the
+    recordings show.
     """
     simulator = problem.simulator
     rows: list[Row] = []
@@ -63,7 +64,8 @@ def firsts(problem: Problem[Simulator], theta: np.ndarray, skip) -> tuple[list[R
     for index in range(len(simulator.effects)):
         names = columns_of(simulator.slots, index)
         columns = list(names.values())
-        if index in skip or not columns:
+        taken = any(simulator.effects[index].excludes(simulator.effects[i]) for i in skip)
+        if taken or not columns:
             continue
         has_one = problem.num_listed(index) == 1
         for place, given in enumerate(_sizes(problem, theta, index, columns)):

@@ -186,6 +186,13 @@ class Effect(abc.ABC):
             return DOFS_OF_JOINT[host.joint(name).type[0]] == 1
         return True
 
+    def excludes(self, other: "Effect") -> bool:
+        """Say whether a model may have this effect or another, not both: one of a kind at a place.
+
+        What is in a model already, and what is added, is checked by it.
+        """
+        return (self.kind, self.target) == (other.kind, other.target)
+
     def check(self, host: mujoco.MjModel) -> None:
         """Check the target against a model.
 

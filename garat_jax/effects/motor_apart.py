@@ -126,6 +126,10 @@ class Transmission(Effect, abc.ABC):
         moving = host.dof_armature[host.joint(name).dofadr[0]] > 0
         return bool(moving) and host.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
 
+    def excludes(self, other: Effect) -> bool:
+        """Say whether both are between one motor and its joint: each takes the motor off."""
+        return isinstance(other, Transmission) and other.target == self.target
+
     @property
     @abc.abstractmethod
     def active(self) -> jax.Array:

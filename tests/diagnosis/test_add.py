@@ -9,8 +9,10 @@ from garat_jax import cli
 from garat_jax.commands import models as commands
 from garat_jax.diagnosis import load_model
 from garat_jax.diagnosis.add import Sized
+from garat_jax.diagnosis.diagnose import make_candidates
 from garat_jax.diagnosis.hidden import make_recordings
-from garat_jax.effects import ViscousDamping
+from garat_jax.diagnosis.model_card import save_card
+from garat_jax.effects import Backlash, ViscousDamping
 from tests import models
 
 
@@ -136,6 +138,21 @@ def test_an_effect_is_not_added_twice(pendulum, capsys):
     assert cli.main(["add", str(out), *arguments, "--out", str(out), "--force"]) == 2
     assert "has viscous_damping at joint/hinge already" in capsys.readouterr().err
     assert len(load_model(out).effects) == 1
+
+
+def test_one_gear_is_between_a_motor_and_its_joint(tmp_path, capsys):
+    """Each takes the motor's inertia off its joint."""
+    (tmp_path / "arm.xml").write_text(models.ARM)
+    model = load_model(tmp_path / "arm.xml")
+    card = str(save_card(tmp_path / "arm.toml", model, [Backlash("joint/elbow", gap=0.01)]))
+    arguments = ["joint_flexibility", "--at", "joint/elbow", "--set", "stiffness=20"]
+    assert cli.main(["add", card, *arguments, "--out", str(tmp_path / "both.toml")]) == 2
+    said = "has backlash at joint/elbow already; it is that or joint_flexibility there"
+    assert said in capsys.readouterr().err
+    for name, is_offered in (("arm.xml", True), ("arm.toml", False)):
+        offered = make_candidates(load_model(tmp_path / name))
+        places = {(effect.kind, effect.target) for effect in offered}
+        assert (("joint_flexibility", "joint/elbow") in places) == is_offered
 
 
 def test_a_card_elsewhere_is_refused_before_the_fit(pendulum, recorded, tmp_path, capsys):

@@ -4,7 +4,7 @@ import pytest
 
 from garat_jax.diagnosis.model_card import load_model, save_card
 from garat_jax.dynamics import Override
-from garat_jax.effects import CATALOGUE
+from garat_jax.effects import CATALOGUE, Backlash
 from garat_jax.errors import UserError
 from tests import models
 
@@ -26,6 +26,10 @@ target = "joint/elbow"
 parameters = { torque = 0.25 }
 """
 FRICTION = CARD[CARD.index("[[effect]]") :]
+GEARS = "".join(
+    f'[[effect]]\nkind = "{kind}"\ntarget = "joint/elbow"\nparameters = {{ {size} }}\n'
+    for kind, size in (("backlash", "gap = 0.01"), ("joint_flexibility", "stiffness = 20.0"))
+)
 
 
 def write(folder, text=CARD):
@@ -67,9 +71,10 @@ def test_every_effect_survives_saving(tmp_path):
     write(tmp_path)
     model = load_model(tmp_path / "arm.xml")
     host = model.compile("mujoco").host.model
-    fitting = [cls for cls in CATALOGUE.values() if cls.targets(host)]  # nothing collides here
-    assert len(fitting) >= len(CATALOGUE) - 2
-    effects = [cls(target=cls.targets(host)[0]) for cls in fitting]
+    fitting = [cls for cls in CATALOGUE.values() if cls.targets(host)]
+    assert len(fitting) >= len(CATALOGUE) - 2 and Backlash in fitting
+    # Gears at one joint exclude each other.
+    effects = [cls(target=cls.targets(host)[0]) for cls in fitting if cls is not Backlash]
     assert load_model(save_card(tmp_path / "all.toml", model, effects)).effects == tuple(effects)
 
 
@@ -141,6 +146,11 @@ def test_card_elsewhere_is_refused(tmp_path):
         ("parameters = { torque = 0.25 }", "", "[[effect]] lacks parameters"),
         ("value = 1.3", "value = nan", "body/forearm mass = nan; expected a finite number"),
         ("[[effect]]", FRICTION + "[[effect]]", "is at joint/elbow twice; write it once"),
+        (
+            "[[effect]]",
+            GEARS + "[[effect]]",
+            "backlash and joint_flexibility are both at joint/elbow, where one of them can be only",
+        ),
     ],
 )
 def test_refusals(tmp_path, old, new, said):
