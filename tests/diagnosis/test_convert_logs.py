@@ -26,7 +26,6 @@ COLUMNS = """
 "qvel.hinge" = {{ from = "{speed}", unit = "deg/s" }}
 "ctrl.motor" = "{torque}"
 """
-AT_HINGE = '"qpos.hinge" = "/joint_states.position[hinge]"'
 OF_ARRAYS = COLUMNS.format(angle="state[0]", speed="state[1]", torque="u")
 OF_BAGS = COLUMNS.format(
     angle="/joint_states.position[hinge]", speed="/joint_states.velocity[1]", torque="/effort.data"
@@ -182,41 +181,6 @@ def test_bags_of_ros_1_and_2(tmp_path, kind):
 def test_a_single_mcap_file(tmp_path):
     (file,) = write_bag(tmp_path, "mcap").glob("*.mcap")
     check(convert(tmp_path, file, OF_BAGS, time="")[1])
-
-
-def read_between(folder, joints_at, columns):
-    """Convert what lies at commands' stamps, 1 ms before those of the states."""
-    log = write_bag(folder, "mcap", joints_at)
-    columns = f'"ctrl.motor" = "/effort.data"\n{columns}'
-    assert convert_only(folder, log, columns, 'clock = "log"') == 0
-    return pd.read_csv(folder / "data.csv")
-
-
-def test_an_angle_that_begins_anew_is_not_interpolated_across_the_jump(tmp_path):
-    angle = (np.pi + 20.0 * STAMPS) % (2 * np.pi) - np.pi
-    made = read_between(tmp_path, lambda k: (["hinge"], [angle[k]]), AT_HINGE)
-    steps = np.diff(np.unwrap(made["qpos.hinge"]))
-    assert np.abs(np.diff(made["qpos.hinge"])).max() > 6.0
-    assert steps == pytest.approx(20.0 / RATE, rel=0.6)
-
-
-def test_a_quaternion_whose_sign_flips_stays_of_length_1(tmp_path):
-    turn = 3.0 * STAMPS
-    quaternion = np.stack([np.cos(turn), np.sin(turn), 0 * turn, 0 * turn], axis=1)
-    quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)  # a logger that keeps w ≥ 0
-    columns = "\n".join(f'"qpos.ball.{i}" = "/joint_states.position[{i}]"' for i in range(4))
-    made = read_between(tmp_path, lambda k: (["a", "b", "c", "d"], quaternion[k]), columns)
-    length = np.linalg.norm(made[[f"qpos.ball.{i}" for i in range(4)]], axis=1)
-    assert length == pytest.approx(np.ones(len(made)), abs=1e-3)
-
-
-def test_joints_that_share_a_topic_with_others_are_read(tmp_path):
-    def by_turns(k):
-        return (["hinge"], [ANGLE[k]]) if k % 2 else (["gripper", "finger"], [0.0, 0.0])
-
-    made = read_between(tmp_path, by_turns, AT_HINGE)
-    at = 0.014 + np.arange(len(made)) / RATE
-    assert made["qpos.hinge"].to_numpy() == pytest.approx(np.interp(at, STAMPS, ANGLE), abs=0.2)
 
 
 def test_the_clock_of_the_log_shifts_the_states_against_the_commands(tmp_path):
