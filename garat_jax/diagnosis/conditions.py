@@ -95,11 +95,9 @@ def add_conditions(
 def read_conditions(
     model: Model, conditions: Mapping[str, Sequence[Path]] | None, columns: Path | None = None
 ) -> dict[str, tuple[Recording, ...]]:
-    """Read the recordings of each condition; see `read_recordings` and `check_conditions`."""
+    """Read the recordings of each condition; see `read_recordings`."""
     named = (conditions or {}).items()
-    found = {name: tuple(read_recordings(model, paths, columns)) for name, paths in named}
-    check_conditions(model, found)
-    return found
+    return {name: tuple(read_recordings(model, paths, columns)) for name, paths in named}
 
 
 def check_conditions(model: Model, conditions: Mapping[str, Sequence[Recording]]) -> None:

@@ -28,13 +28,12 @@ from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import progress
-from garat_jax.diagnosis.repeat import found_theta, repeatability
+from garat_jax.diagnosis.repeat import found_theta, repeatability, sized_columns
 from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosis_sections
 from garat_jax.diagnosis.report_conditions import condition_sections
 from garat_jax.diagnosis.results import Diagnosis, Rung, Verdict
 from garat_jax.diagnosis.segments import grid_for
 from garat_jax.diagnosis.simulate import Simulator
-from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.view import repaired
 from garat_jax.effects.catalogue import Catalogue
@@ -195,13 +194,7 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     longest = longest_errors(problem, final, everything, grid, host, how)
     if few_segments(problem):
         return rungs, error, longest, ()
-    told = tuple(
-        j
-        for number, candidate in enumerate(added)
-        for name, j in columns_of(simulator.slots, number).items()
-        if (size := candidate.parameters.get(name)) and np.isfinite(size.high - size.low)
-    )
-    whole = dataclasses.replace(fits[-1], free=told)
+    whole = dataclasses.replace(fits[-1], free=tuple(sized_columns(simulator, added)))
     return rungs, error, longest, find_drifts(problem, whole, everything)
 
 

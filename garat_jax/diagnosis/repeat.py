@@ -50,6 +50,19 @@ def found_theta(simulator: Simulator, selected: Sequence[Candidate]) -> np.ndarr
     return theta
 
 
+def sized_columns(
+    simulator: Simulator, selected: Sequence[Candidate]
+) -> dict[int, tuple[Candidate, str]]:
+    """Return which parameters a diagnosis sized, by their place in `theta`: of what, by name."""
+    index = {Named(e.kind, e.target): i for i, e in enumerate(simulator.effects)}
+    return {
+        j: (candidate, name)
+        for candidate in selected
+        for name, j in columns_of(simulator.slots, index[candidate.named]).items()
+        if (size := candidate.parameters.get(name)) and np.isfinite(size.high - size.low)
+    }
+
+
 def repeatability(
     model: Model,
     found: Diagnosis,
@@ -131,11 +144,8 @@ def _alone(
     everywhere = np.ones(len(segments.start), bool)
     whole = Problem(simulator, segments, everywhere, grid.sample)
     free = {
-        j: _Parameter(candidate.named, name, estimate.unit)
-        for number, candidate in zip(acting, selected, strict=True)
-        for name, j in columns_of(simulator.slots, number).items()
-        if (estimate := candidate.parameters.get(name))
-        and np.isfinite(estimate.high - estimate.low)
+        j: _Parameter(candidate.named, name, candidate.parameters[name].unit)
+        for j, (candidate, name) in sized_columns(simulator, selected).items()
     }
     longer = cut_longer(whole, everything, grid, theta)
     whole, settled = longer or (whole, settle(whole, theta, segments.start))

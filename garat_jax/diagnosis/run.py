@@ -8,7 +8,12 @@ from typing import NamedTuple
 from rich.console import Console
 
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.conditions import add_conditions, read_conditions, write_cards
+from garat_jax.diagnosis.conditions import (
+    add_conditions,
+    check_conditions,
+    read_conditions,
+    write_cards,
+)
 from garat_jax.diagnosis.diagnose import diagnose_keeping
 from garat_jax.diagnosis.export import copy_model
 from garat_jax.diagnosis.model_card import load_model
@@ -58,6 +63,7 @@ def run_diagnose(
     loaded = load_model(model, catalogue)
     recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
     others = read_conditions(loaded, conditions, columns)
+    check_conditions(loaded, others)
     copied = copy_model(loaded, run.path("model")) if others else loaded.mjcf
     with progress("looking at the recordings") as say:
         base, simulator = diagnose_keeping(loaded, recordings, held_out, say)

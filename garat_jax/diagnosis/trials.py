@@ -54,18 +54,20 @@ class Trial(NamedTuple):
 def firsts(problem: Problem[Simulator], theta: np.ndarray, skip) -> tuple[list[Row], list[Trial]]:
     """List each candidate at each of its sizes, a row for each.
 
-    Those that what is skipped excludes are none. Where one size of one parameter is all that a law
-    lists, and its parameters act alone, each of them has a trial: any may be the one that the
-    recordings show.
+    What is skipped is none, nor is what excludes a skipped one that acts. Where one size of one
+    parameter is all that a law lists, and its parameters act alone, each of them has a trial: any
+    may be the one that the recordings show.
     """
     simulator = problem.simulator
+    added = {simulator.slots[j].effect for j in np.flatnonzero(theta != simulator.base)}
+    acting = [simulator.effects[i] for i in added.intersection(skip)]
     rows: list[Row] = []
     trials = []
     for index in range(len(simulator.effects)):
         names = columns_of(simulator.slots, index)
         columns = list(names.values())
-        taken = any(simulator.effects[index].excludes(simulator.effects[i]) for i in skip)
-        if taken or not columns:
+        taken = any(simulator.effects[index].excludes(other) for other in acting)
+        if index in skip or taken or not columns:
             continue
         has_one = problem.num_listed(index) == 1
         for place, given in enumerate(_sizes(problem, theta, index, columns)):

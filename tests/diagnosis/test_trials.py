@@ -10,9 +10,10 @@ from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.screen import _measure, screen
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.trials import enlarge, firsts
-from garat_jax.effects import GravityTilt, TorqueOffset
+from garat_jax.effects import Backlash, GravityTilt, JointFlexibility, TorqueOffset
+from tests import models
 from tests.diagnosis import pendulum
-from tests.diagnosis.test_fit import UNIFORM, candidates, column, make_problem, record
+from tests.diagnosis.test_fit import MODEL, UNIFORM, candidates, column, make_problem, record
 
 
 class Jumping:
@@ -62,6 +63,22 @@ def test_steps_grow_where_few_samples_make_the_change():
     changes[0, friction] = 1e3  # most samples do not change at all
     rare, _ = enlarge(problem, rows, trials, changes, np.full(1000, 5.0), every)[friction]
     assert rare.step == pytest.approx(5 * rows[friction].step)
+
+
+def test_a_gear_is_no_candidate_where_another_acts():
+    spec = models.spec(models.PENDULUM)
+    spec.joints[0].armature = 0.01
+    model = dataclasses.replace(MODEL, spec=spec)
+    gears = (Backlash("joint/hinge"), JointFlexibility("joint/hinge"))
+    problem = make_problem([record(UNIFORM)], gears, model=model)
+
+    def tried(theta):
+        return {trial.effect for trial in firsts(problem, theta, skip=[0])[1]}
+
+    nothing = problem.simulator.base
+    gap = np.where(np.arange(len(nothing)) == column(problem.simulator, "backlash"), 0.1, nothing)
+    assert tried(nothing) == {1}
+    assert tried(gap) == set()
 
 
 def test_of_parameters_that_act_alone_the_one_that_is_seen_comes_first():
