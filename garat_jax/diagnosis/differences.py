@@ -34,7 +34,12 @@ class Differences(NamedTuple):
 
 
 def clear_differences(
-    problem: Problem, theta, start, free, sensitivity: np.ndarray | None = None
+    problem: Problem,
+    theta,
+    start,
+    free,
+    sensitivity: np.ndarray | None = None,
+    least: np.ndarray | float = STEP,
 ) -> Differences:
     """Linearise with steps as wide as it takes.
 
@@ -49,28 +54,29 @@ def clear_differences(
         start: Initial states, [S, nq + nv].
         free: Indices of the parameters.
         sensitivity: As for `linearise`.
+        least: Steps to begin with, relative to each parameter's `scale` or size, a number or [k].
     """
     free = np.asarray(free, int)
-    relative, alike = np.full(len(free), STEP), np.ones(len(free))
+    relative, alike = np.full(len(free), least), np.ones(len(free))
     steps = difference_steps(problem, theta, free, relative)
     lin = linearise(problem, theta, start, free, steps, sensitivity)
     last, _ = projected(problem, lin)
     tried = np.flatnonzero([is_erratic(column, problem.num_signals) for column in last.T])
     alike[tried] = 0.0
-    wider = STEP
+    wider, is_first = relative.copy(), True
     last = last * steps
     while len(tried):
         wider *= WIDER
-        steps = difference_steps(problem, theta, free[tried], wider)
+        steps = difference_steps(problem, theta, free[tried], wider[tried])
         far = linearise(problem, theta, start, free[tried], steps, lin.start, lin.residual)
         changes = projected(problem, far)[0] * steps
         cosine = cosines(changes - last[:, tried], last[:, tried])
         last[:, tried] = changes
-        is_first = wider == WIDER * STEP  # the smallest step will do
         better = cosine > alike[tried]
         alike[tried] = np.maximum(alike[tried], cosine)
-        better &= ~(is_first & (cosine >= ALIKE))
-        relative[tried[better]] = wider
+        better &= ~(is_first & (cosine >= ALIKE))  # the smallest step will do
+        is_first = False
+        relative[tried[better]] = wider[tried[better]]
         lin.parameters[..., tried[better]] = far.parameters[..., better]
         has_room = WIDER * np.abs(steps) < WIDEST * _widths(problem, free[tried])
         tried = tried[(cosine < ALIKE) & has_room]

@@ -67,12 +67,12 @@ def count_timestep(problem: Problem, fitted: Fit, num_refitted: int = REFITTED) 
         return fitted
     differences = clear_differences(problem, fitted.theta, fitted.start, fitted.free)
     if not _are_smooth(differences, excited) and _is_coarse(problem, fitted):
-        return _at_finer_timesteps(problem, fitted, num_refitted)
+        return _at_finer_timesteps(problem, fitted, num_refitted, differences.relative)
     fitted, lin, rough = _at_minimum(problem, fitted, differences)
     if moved := _extrapolated(problem, fitted, lin, rough):
         return moved
     if _is_coarse(problem, fitted):
-        return _at_finer_timesteps(problem, fitted, num_refitted)
+        return _at_finer_timesteps(problem, fitted, num_refitted, differences.relative)
     low, high = _interval(problem, fitted.theta, fitted, lin, rough)
     shift = _shift_by_fits(problem, fitted, num_refitted)
     low, high = low + np.minimum(shift, 0.0), high + np.maximum(shift, 0.0)
@@ -158,20 +158,29 @@ def _extrapolated(
     return dataclasses.replace(follow(problem, moved, fitted), low=low - unsure, high=high + unsure)
 
 
-def _at_finer_timesteps(problem: Problem, fitted: Fit, num_refitted: int) -> Fit:
+def _at_finer_timesteps(
+    problem: Problem, fitted: Fit, num_refitted: int, relative: np.ndarray
+) -> Fit:
     """Return a fit as ever finer timesteps have it, until a timestep of 0 would hardly change it.
 
     The integrator's error falls with the timestep. But contacts hold a fit back on its way, so that
     each is taken to the middle of the dips around it, and what the last timestep changed may be to
-    come once more, and counts as unsure. The noise is the same at each: an interval that is
-    narrower than at the timestep before is so by chance. Where a finer timestep explains less, the
-    estimates stay, and their intervals reach as far.
+    come once more, and counts as unsure. Where predictions jumped at the timestep before, a clear
+    difference is one within a dip, so that none is narrower than there. The noise is the same at
+    each: an interval that is narrower than at the timestep before is so by chance. Where a finer
+    timestep explains less, the estimates stay, and their intervals reach as far.
+
+    Args:
+        problem: What is fitted.
+        fitted: The fit.
+        num_refitted: Segments that are fitted again, at least.
+        relative: Finite differences by which its parameters were clear, [k]; see `Differences`.
     """
     excited = _excited(fitted)
     free = np.asarray(fitted.free)[excited]
     chosen = _chosen(problem, num_refitted)
     some, near = problem.take(chosen), fitted.take(chosen)
-    coarse, change = _left(some, near), np.zeros(len(free))
+    coarse, change, relative = _left(some, near), np.zeros(len(free)), relative[excited]
     half = half_before = (fitted.high - fitted.low)[excited] / 2
     for number in range(REFINEMENTS):
         half_before = half
@@ -184,10 +193,11 @@ def _at_finer_timesteps(problem: Problem, fitted: Fit, num_refitted: int) -> Fit
             sensitivity=before.sensitivity,
             searches=number == 0,
         )
-        differences = clear_differences(some, near.theta, near.start, free)
-        near, _, rough = _at_minimum(some, near, differences)
-        change = (near.theta - before.theta)[free]
-        half = np.hypot((near.high - near.low) / 2, rough)
+        differences = clear_differences(some, near.theta, near.start, free, least=relative)
+        near, lin, rough = _at_minimum(some, near, differences)
+        relative, change = differences.relative, (near.theta - before.theta)[free]
+        low, high = _interval(some, near.theta, near, lin, rough)
+        half = (high - low) / 2
         if np.all(np.abs(change) <= SETTLED * half):
             break
     half = np.maximum(half, half_before)

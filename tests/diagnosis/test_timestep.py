@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis import timestep
-from garat_jax.diagnosis.differences import clear_differences
+from garat_jax.diagnosis.differences import STEP, clear_differences
 from garat_jax.diagnosis.fit import converge, fit
 from garat_jax.diagnosis.held_out import warn_of_timestep
 from garat_jax.diagnosis.measurements import Recording
@@ -57,6 +57,10 @@ def test_a_shift_that_does_less_or_more_than_promised_is_not_made(monkeypatch, k
         assert counted.high[0] - counted.low[0] > 2 * abs(1 - kept) * shift
 
 
+SMALL = np.array([STEP])
+"""Finite difference of one parameter that makes nothing jump."""
+
+
 class Shifted:
     """A simulator in which damping acts more, by an error that is as large as the timestep."""
 
@@ -79,14 +83,44 @@ def test_fits_at_the_whole_and_half_the_timestep_say_how_far_the_whole_is_from_n
     found = converged(problem, np.array([0.02]))
     assert found.theta[0] == pytest.approx(0.016, rel=0.05)
     assert timestep._shift_by_fits(problem, found, 24)[0] == pytest.approx(0.004, rel=0.05)
-    finer = timestep._at_finer_timesteps(problem, found, 24)
+    finer = timestep._at_finer_timesteps(problem, found, 24, SMALL)
     assert finer.theta[0] == pytest.approx(0.02 - 0.004 / 16, rel=0.03)
     assert finer.low[0] < 0.02 < finer.high[0]
 
 
+class Dipped:
+    """A simulator whose cost has a dip at every 1e-3 of its parameter, in a signal of its own."""
+
+    def __init__(self, simulator):
+        self._simulator = simulator
+        self.effects, self.slots, self.base = simulator.effects, simulator.slots, simulator.base
+        self.host = simulator.host
+
+    def predict(self, theta, start, segments):
+        predicted = self._simulator.predict(theta, start, segments)
+        wave = 2e-3 * np.sin(1.7 * np.arange(predicted.shape[2]))
+        off = np.sin(np.pi * (theta[..., 0] - 0.02) / 1e-3)
+        predicted[..., 0] += off.reshape(len(predicted), -1, 1) * wave
+        return predicted
+
+    def refined(self, factor: int):
+        return Dipped(self._simulator.refined(factor))
+
+
+def test_a_fit_does_not_stay_in_a_dip_that_was_none_at_the_timestep_before():
+    problem, found = damped(noise=1e-3)
+    problem = dataclasses.replace(problem, simulator=Dipped(problem.simulator))
+    found = dataclasses.replace(found, theta=np.array([0.024]))
+    in_dip = timestep._at_finer_timesteps(problem, found, 24, SMALL)
+    assert in_dip.theta[0] == pytest.approx(0.024, abs=1e-4)
+    beyond = timestep._at_finer_timesteps(problem, found, 24, np.array([1.0]))
+    assert beyond.theta[0] == pytest.approx(0.02, abs=1e-3)
+    assert beyond.low[0] < 0.02 < beyond.high[0]
+
+
 def test_across_contacts_every_finer_fit_is_taken_to_the_middle_of_its_dips(monkeypatch):
     problem, found = damped(noise=1e-3)
-    exact, asked = timestep._at_finer_timesteps(problem, found, 24), []
+    exact, asked = timestep._at_finer_timesteps(problem, found, 24, SMALL), []
     off, rough = 1e-3, 5e-3
 
     def smoothed(some, near, columns, covariance, sure):
@@ -95,7 +129,7 @@ def test_across_contacts_every_finer_fit_is_taken_to_the_middle_of_its_dips(monk
 
     monkeypatch.setattr(timestep, "_are_smooth", lambda *_: False)
     monkeypatch.setattr(timestep, "smooth_minimum", smoothed)
-    counted = timestep._at_finer_timesteps(problem, found, 24)
+    counted = timestep._at_finer_timesteps(problem, found, 24, SMALL)
     assert asked[0] is problem.simulator.refined(timestep.REFINED)
     assert counted.theta[0] == pytest.approx(exact.theta[0] + off, abs=0.3 * off)
     assert exact.high[0] < exact.theta[0] + 0.5 * rough
