@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.dynamics import Dynamics, PhysicsState, compile, initial_state, step, view
-from garat_jax.effects import CATALOGUE, Effect
+from garat_jax.effects import CATALOGUE, Effect, Suggestion
 from garat_jax.effects.base import ModelView
 from garat_jax.effects.catalogue import line_in
 from garat_jax.engine import HostModel
@@ -73,6 +73,25 @@ def try_own(
             jax.eval_shape(lambda world: _check_shapes(world), alone)
             jax.eval_shape(lambda world: _one_step(world), alone)
             check_identity(alone.host, type(effect), effect.target)
+
+
+def asked(effect: Effect, method: str, *seen: Any) -> Suggestion | None:
+    """Return what an effect's `suggested` or `suggested_by_commands` says of what was seen.
+
+    Raises:
+        UserError: It is a user's own, and fails, or returns anything but sizes at which to try it.
+    """
+    suggest = getattr(effect, method)
+    if not is_own(effect):
+        return suggest(*seen)
+    with _named(effect):
+        answer = suggest(*seen)
+        if answer is not None and not isinstance(answer, Suggestion):
+            what = f"{method} returns something else than a Suggestion or None"
+            raise _mistake(effect, method, what)
+        if answer is not None:
+            _check_sizes(effect, method, answer.starts)
+        return answer
 
 
 @functools.lru_cache(maxsize=1000)
@@ -149,16 +168,18 @@ def _done_by(dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Arr
 
 def _check_starts(effect: Effect, host: mujoco.MjModel) -> None:
     """Refuse sizes to try an effect at that are none, or of parameters that it has not."""
+    if effect.parameters():
+        _check_sizes(effect, "starts", effect.starts(host, effect.target))
+
+
+def _check_sizes(effect: Effect, method: str, sizes: Sequence[Mapping[str, float]]) -> None:
     known = [p.name for p in effect.parameters()]
-    if not known:
-        return
-    sizes = effect.starts(host, effect.target)
     if not sizes or not all(sizes):
-        raise _mistake(effect, "starts", "starts lists no size at which to try it")
+        raise _mistake(effect, method, f"{method} lists no size at which to try it")
     for name in {name: None for size in sizes for name in size}:
         if name not in known:
             what = str(unknown_name("parameter", name, known))
-            raise _mistake(effect, "starts", f"starts has an {what}")
+            raise _mistake(effect, method, f"{method} has an {what}")
 
 
 def _check_shapes(dynamics: Dynamics) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.own_effects import asked
 from garat_jax.diagnosis.robust import orthonormal, without
 from garat_jax.dynamics import Dynamics
 from garat_jax.effects import Effect, Suggestion
@@ -36,12 +37,12 @@ def suggest(
     Returns:
         Suggestions by the effect's index.
     """
-    asked = {index: effect for index, effect in enumerate(effects) if _may_answer(effect)}
-    if not asked:
+    able = {index: effect for index, effect in enumerate(effects) if _may_answer(effect)}
+    if not able:
         return {}
     missing = missing_torque(host, recordings, world)
     torques = functools.cache(lambda dof: (_without_friction(missing, dof), _ripples(missing, dof)))
-    answers = {index: _suggestion(effect, missing, torques) for index, effect in asked.items()}
+    answers = {index: _suggestion(effect, missing, torques) for index, effect in able.items()}
     return {index: answer for index, answer in answers.items() if answer is not None}
 
 
@@ -58,11 +59,11 @@ def _suggestion(effect: Effect, missing: MissingTorque, torques) -> Suggestion |
     element, _, name = effect.target.partition("/")
     if element == "actuator":
         at = missing.actuators.index(name)
-        return effect.suggested_by_commands(missing.ctrl[:, at], missing.drive[:, at])
+        return asked(effect, "suggested_by_commands", missing.ctrl[:, at], missing.drive[:, at])
     if element != "joint" or name not in missing.dofs:
         return None
     dof = missing.dofs.index(name)
-    return effect.suggested(missing.position[:, dof], *torques(dof))
+    return asked(effect, "suggested", missing.position[:, dof], *torques(dof))
 
 
 def _without_friction(m: MissingTorque, dof: int) -> np.ndarray:

@@ -4,13 +4,14 @@ import dataclasses
 import importlib.metadata
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from garat_jax import cli
 from garat_jax.diagnosis import load_model
 from garat_jax.diagnosis.add import add
 from garat_jax.diagnosis.diagnose import make_candidates
-from garat_jax.diagnosis.own_effects import check_identity
+from garat_jax.diagnosis.own_effects import asked, check_identity
 from garat_jax.diagnosis.view import repaired
 from garat_jax.dynamics import Override, compile
 from garat_jax.effects import CATALOGUE
@@ -199,6 +200,27 @@ def test_what_tells_places_and_sizes_is_checked_before_a_diagnosis(mine, method,
     model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
     with pytest.raises(UserError) as caught:
         make_candidates(model)
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(f"effect my_spring ({mine}")
+    assert said in line
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("return [0.5]", "line 25): suggested returns something else than a Suggestion or None"),
+        ("return Suggestion(({'stifness': 1.0},), 1)", "did you mean stiffness"),
+        ("return Suggestion((), 1)", "line 25): suggested lists no size"),
+        ("return torque / 'N m'", "line 27): "),
+    ],
+)
+def test_what_a_law_suggests_is_checked(mine, body, said):
+    head = "@classmethod\n    def suggested(cls, position, torque, rests):"
+    text = MINE.replace("import Effect", "import Effect, Suggestion")
+    mine.write_text(f"{text}\n    {head}\n        {body}\n")
+    (cls,) = (c for c in load_catalogue([mine]).values() if c.kind == "my_spring")
+    with pytest.raises(UserError) as caught:
+        asked(cls(target="joint/hinge"), "suggested", np.zeros(5), np.zeros(5), np.zeros((2, 5)))
     (line,) = str(caught.value).splitlines()
     assert line.startswith(f"effect my_spring ({mine}")
     assert said in line
