@@ -176,7 +176,7 @@ def hidden_effects_before(seeds: tuple[int, ...]) -> str:
     sets = [f"{result['sample']} of {result['cases']}" for result in results.values()]
     columns = ("measure", *(f"seed {seed}" for seed in seeds))
     origins = [
-        origin(f"hidden_effects_seed_{seed}", result) + commits(result["rows"])
+        commits(result["rows"]) + origin(f"hidden_effects_seed_{seed}", result)
         for seed, result in results.items()
     ]
     return table(columns, [*rows, ("sets of recordings", *sets)]) + "".join(origins)
