@@ -1,10 +1,10 @@
 """Measure environment steps a second with learning in them, beside other libraries and the engine.
 
 `python benchmarks/throughput.py`: iterations of TRPO with the presets' settings and of PPO with
-`PPOConfig`'s; the same steps with random actions; C MuJoCo alone; and other libraries' TRPO and PPO with the same
-hyper-parameters in the same worlds. All are compiled and warm, and run in turns. The result is
-written anew after each world, so that a run that is cut off keeps those it has, and says which it
-lacks.
+`PPOConfig`'s; the same steps with random actions; C MuJoCo alone; and other libraries' TRPO and PPO
+with the same hyper-parameters in the same worlds. All are compiled and warm, and run in turns. The
+result is written anew after each world, so that a run that is cut off keeps those it has, and says
+which it lacks.
 """
 
 import dataclasses

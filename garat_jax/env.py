@@ -13,6 +13,7 @@ import numpy as np
 
 from garat_jax import dynamics
 from garat_jax.dynamics import Dynamics, PhysicsState
+from garat_jax.effects import check_together
 from garat_jax.errors import UserError
 from garat_jax.overrides import load_spec
 from garat_jax.types import Params
@@ -341,7 +342,8 @@ def make_world(
     """Compile a task's model with overrides and effects.
 
     Raises:
-        UserError: As `dynamics.compile` and `TaskEnv`.
+        UserError: As `dynamics.compile` and `TaskEnv`; two of the effects are exclusive.
     """
+    check_together(effects)
     params = dynamics.compile(load_spec(task.mjcf), overrides, effects, engine)
     return World(TaskEnv(task, params), params)

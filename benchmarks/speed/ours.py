@@ -63,7 +63,7 @@ def random_agent(env: Env, num_envs: int, num_steps: int) -> Agent:
 
 
 def make_agent(name: str, env: Env, size: Size) -> Agent:
-    """Build one of our learners: TRPO of the presets but for the size and `FIFTH`, PPO, `RANDOM`."""
+    """Build one of our learners; TRPO is as in the presets but for the size and `FIFTH`."""
     if name == RANDOM:
         return random_agent(env, size.num_envs, size.num_steps)
     if name in ("trpo", FIFTH):

@@ -30,7 +30,7 @@ from garat_jax.diagnosis.suggest import suggest
 from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.diagnosis.units import after_number
 from garat_jax.dynamics import native_model
-from garat_jax.effects import Effect, unit_at
+from garat_jax.effects import Effect, are_exclusive, unit_at
 from garat_jax.effects.bounds import check_bounds
 from garat_jax.effects.catalogue import choose_kind
 from garat_jax.errors import UserError
@@ -154,9 +154,9 @@ def choose_effect(model: Model, kind: str, target: str, values: Mapping[str, flo
     check_bounds(effect, host)
     try_own(model.spec, model.overrides, (effect,))
     for present in model.effects:
-        if effect.excludes(present):
-            do = "change it" if present.kind == kind else f"it is that or {kind}"
-            raise UserError(f"{model.path} has {present.kind} at {target} already; {do} there")
+        if are_exclusive(effect, present):
+            do = "change it there" if present.kind == kind else f"it is that or {kind} at {target}"
+            raise UserError(f"{model.path} has {present.kind} at {present.target} already; {do}")
     return effect
 
 

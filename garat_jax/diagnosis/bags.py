@@ -96,7 +96,7 @@ def _rows(
     """Return seconds and value of each message of an open bag, by the names of `wanted`.
 
     Messages that do not hold an element by its name are passed over: an arm and its gripper may
-    tell their joints' states on one topic.
+    tell their joints' states on one topic. A number counts elements where no message has that name.
     """
     topics = reader.topics
     for source in wanted.values():
@@ -105,6 +105,7 @@ def _rows(
     chosen = {source.topic for source in wanted.values()}
     connections = [c for c in reader.connections if c.topic in chosen]
     found: dict[str, list[tuple[float, float]]] = {text: [] for text in wanted}
+    counted: dict[str, list[tuple[float, float]]] = {text: [] for text in wanted}
     others: dict[str, set[str]] = {}
     for connection, stamp, raw in reader.messages(connections):
         message = _message(reader, raw, connection)
@@ -116,18 +117,30 @@ def _rows(
                     found[text].append((time, _value(message, source)))
                 except _NotInMessageError as error:
                     others.setdefault(text, set()).update(error.names)
+                    if error.counted is not None:
+                        counted[text].append((time, error.counted))
     for text, source in wanted.items():
+        found[text] = found[text] or counted[text]
+        if text in others and not found[text] and str(source.element).isdigit():
+            what = f"no message of {source.topic} has an element [{source.element}]"
+            raise UserError(f"{what} of {source.field}, by name or by number")
         if text in others and not found[text]:
             raise unknown_name(f"name in {source.topic}", str(source.element), sorted(others[text]))
     return found
 
 
 class _NotInMessageError(Exception):
-    """A message does not name the element that is wanted; `names` are those that it has."""
+    """A message does not name the element that is wanted.
 
-    def __init__(self, names: set[str]):
+    Attributes:
+        names: Those that it has.
+        counted: The value at the place that the element is, if that is a number; None else, and
+            where there is no such place.
+    """
+
+    def __init__(self, names: set[str], counted: float | None):
         super().__init__(names)
-        self.names = names
+        self.names, self.counted = names, counted
 
 
 def _message(reader: Any, raw: bytes, connection: Any) -> Any:
@@ -186,13 +199,11 @@ def _element(values: Any, owner: Any, source: Source) -> Any:
     if np.ndim(values) != 1:
         raise UserError(f"{source.topic}.{source.field} is no array, so it has no [{element}]")
     names = list(_fields(owner).get("name", ()))
-    if element in names:
-        index = names.index(element)
-    elif element.isdigit():
-        index = int(element)
-    else:
-        raise _NotInMessageError(set(names))
-    if index >= len(values):
+    index = names.index(element) if element in names else int(element) if element.isdigit() else -1
+    is_there = 0 <= index < len(values)
+    if names and element not in names:
+        raise _NotInMessageError(set(names), float(values[index]) if is_there else None)
+    if not is_there:
         raise UserError(
             f"{source.topic}.{source.field} has {len(values)} elements, so it has no [{element}]"
         )

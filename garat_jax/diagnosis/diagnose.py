@@ -38,7 +38,7 @@ from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.suggest import suggest
 from garat_jax.diagnosis.unseen import is_still, unseen
 from garat_jax.dynamics import native_model
-from garat_jax.effects import Effect
+from garat_jax.effects import Effect, are_exclusive
 from garat_jax.errors import UserError
 from garat_jax.provenance import versions
 
@@ -205,7 +205,7 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
     for cls in model.catalogue.values():
         for effect in everywhere(cls, host):
             alone = effect.target == "all" and "actuator" in cls.elements and host.nu < 2
-            if not alone and not any(effect.excludes(present) for present in model.effects):
+            if not alone and not any(are_exclusive(effect, present) for present in model.effects):
                 candidates.append(effect)
     return tuple(candidates)
 

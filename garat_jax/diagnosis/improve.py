@@ -24,7 +24,7 @@ from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.held_out import are_explained, errors_of, longest_errors
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.metric import make_metric, noise_floor
+from garat_jax.diagnosis.metric import is_above, make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, load_model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import progress
@@ -73,6 +73,7 @@ class Improvement:
         for rung in self.diagnosis.ladder:
             added = self.diagnosis.added(rung)
             lines.append(f"  {added}: held-out error {rung.error_holdout:.4g}")
+        lines += [f"  drift: {drift}" for drift in self.diagnosis.drifts]
         return "\n".join([*lines, *self.diagnosis.other_conditions])
 
     def _repr_html_(self) -> str:
@@ -86,7 +87,17 @@ class Improvement:
     def to_json(self) -> dict[str, Any]:
         """Return the content of improve.json."""
         whole = self.diagnosis.to_json()
-        kept = ("model", "data", "holdout", "versions", "verdict", "error", "longest", "ladder")
+        kept = (
+            "model",
+            "data",
+            "holdout",
+            "versions",
+            "verdict",
+            "error",
+            "longest",
+            "ladder",
+            "drifts",
+        )
         return {
             "format": FORMAT,
             **{key: whole[key] for key in kept},
@@ -192,7 +203,7 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
     host, floor = simulator.host, noise_floor(problem, metric, fits[-1])
     error = errors_of(problem, (fits[0], fits[-1]), floor, host, how)
     longest = longest_errors(problem, final, everything, grid, host, how)
-    if few_segments(problem):
+    if few_segments(problem) or not is_above(problem, metric, fits[-1], floor):
         return rungs, error, longest, ()
     whole = dataclasses.replace(fits[-1], free=tuple(sized_columns(simulator, added)))
     return rungs, error, longest, find_drifts(problem, whole, everything)

@@ -16,7 +16,7 @@ import numpy as np
 
 from garat_jax.diagnosis.own_effects import try_own
 from garat_jax.dynamics import Dynamics, Override, compile
-from garat_jax.effects import CATALOGUE, Effect
+from garat_jax.effects import CATALOGUE, Effect, check_together
 from garat_jax.effects.bounds import check_bounds
 from garat_jax.effects.catalogue import Catalogue, choose_kind, load_catalogue
 from garat_jax.effects.elements import element_names
@@ -140,25 +140,13 @@ def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
         overrides = tuple(_override(table) for table in _tables(card, "override"))
         effects = tuple(_effect(table, catalogue) for table in _tables(card, "effect"))
         host = compile(spec, overrides, engine="mujoco").host.model
-        for number, effect in enumerate(effects):
-            for other in effects[:number]:
-                _check_both(effect, other)
+        check_together(effects)
+        for effect in effects:
             effect.check(host)
             check_bounds(effect, host)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     return Model(path.stem, path, mjcf, spec, overrides, effects, catalogue)
-
-
-def _check_both(effect: Effect, other: Effect) -> None:
-    """Check that a card may have both of two effects."""
-    if not effect.excludes(other):
-        return
-    if effect.kind == other.kind:
-        raise UserError(f"{effect.kind} is at {effect.target} twice; write it once")
-    raise UserError(
-        f"{other.kind} and {effect.kind} are both at {effect.target}, where one of them can be only"
-    )
 
 
 def save_card(path: str | Path, model: Model, extra_effects: Sequence[Effect] = ()) -> Path:

@@ -47,7 +47,7 @@ def everywhere(cls: type[Effect], host: mujoco.MjModel) -> list[Effect]:
         for target in cls.targets(host):
             made.append(cls(target=target, **cls.at(host, target)))
             if not is_built_in:
-                _check_starts(made[-1], host)
+                _check_choices(made[-1], host)
     return made
 
 
@@ -68,7 +68,7 @@ def try_own(
                 alone = compile(spec, overrides, (effect,), "mujoco")
             except UserError:
                 continue  # it may need another effect; compiling all of them says what is amiss
-            _check_starts(effect, alone.host.model)
+            _check_choices(effect, alone.host.model)
             # Functions of their own: JAX would take a law that was read anew for the one before.
             jax.eval_shape(lambda world: _check_shapes(world), alone)
             jax.eval_shape(lambda world: _one_step(world), alone)
@@ -86,11 +86,12 @@ def asked(effect: Effect, method: str, *seen: Any) -> Suggestion | None:
         return suggest(*seen)
     with _named(effect):
         answer = suggest(*seen)
-        if answer is not None and not isinstance(answer, Suggestion):
+        if answer is None:
+            return None
+        if not isinstance(answer, Suggestion) or not isinstance(answer.num_tried, int | np.integer):
             what = f"{method} returns something else than a Suggestion or None"
             raise _mistake(effect, method, what)
-        if answer is not None:
-            _check_sizes(effect, method, answer.starts)
+        _check_sizes(effect, method, answer.starts)
         return answer
 
 
@@ -166,20 +167,32 @@ def _done_by(dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Arr
     }
 
 
-def _check_starts(effect: Effect, host: mujoco.MjModel) -> None:
-    """Refuse sizes to try an effect at that are none, or of parameters that it has not."""
-    if effect.parameters():
-        _check_sizes(effect, "starts", effect.starts(host, effect.target))
-
-
-def _check_sizes(effect: Effect, method: str, sizes: Sequence[Mapping[str, float]]) -> None:
-    known = [p.name for p in effect.parameters()]
+def _check_choices(effect: Effect, host: mujoco.MjModel) -> None:
+    """Refuse sizes to try an effect at that are none; call what else is asked of it on the way."""
+    effect.excludes(effect)
+    if not effect.parameters():
+        return
+    sizes = effect.starts(host, effect.target)
+    _check_sizes(effect, "starts", sizes)
     if not sizes or not all(sizes):
-        raise _mistake(effect, method, f"{method} lists no size at which to try it")
-    for name in {name: None for size in sizes for name in size}:
+        raise _mistake(effect, "starts", "starts lists no size at which to try it")
+    for size in sizes:
+        effect.beside(size, size)
+
+
+def _check_sizes(effect: Effect, method: str, sizes: Any) -> None:
+    """Refuse what are no parameters of an effect, or beyond their bounds."""
+    known = {p.name: p for p in effect.parameters()}
+    if not isinstance(sizes, tuple | list) or not all(isinstance(s, Mapping) for s in sizes):
+        raise _mistake(effect, method, f"{method} lists something else than parameters by name")
+    for name, value in ((name, value) for size in sizes for name, value in size.items()):
         if name not in known:
             what = str(unknown_name("parameter", name, known))
             raise _mistake(effect, method, f"{method} has an {what}")
+        number, p = np.asarray(value), known[name]
+        if number.shape or number.dtype.kind not in "fiu" or not p.low <= number <= p.high:
+            what = f"{method} has {name} = {value!r}, not a number from {p.low:g} to {p.high:g}"
+            raise _mistake(effect, method, what)
 
 
 def _check_shapes(dynamics: Dynamics) -> None:

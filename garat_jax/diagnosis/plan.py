@@ -23,6 +23,7 @@ from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
+from garat_jax.effects import check_together
 from garat_jax.effects.catalogue import choose_kind
 from garat_jax.effects.elements import element_names
 from garat_jax.errors import UserError, unknown_name
@@ -115,7 +116,11 @@ def parse_place(text: str, model: Model) -> Place:
         raise UserError(f"{kind} can act at {', '.join(targets)}; write {kind}@TARGET")
     if target and target not in targets:
         raise unknown_name(f"target of {kind}", target, targets)
-    return Place(kind, target or targets[0])
+    place = Place(kind, target or targets[0])
+    for present in model.effects:
+        if Place(present.kind, present.target) != place:  # one of the card may be another size
+            check_together((present, cls(target=place.target)))
+    return place
 
 
 def plan(

@@ -54,13 +54,17 @@ def sized_columns(
     simulator: Simulator, selected: Sequence[Candidate]
 ) -> dict[int, tuple[Candidate, str]]:
     """Return which parameters a diagnosis sized, by their place in `theta`: of what, by name."""
-    index = {Named(e.kind, e.target): i for i, e in enumerate(simulator.effects)}
+    index = _indices(simulator)
     return {
         j: (candidate, name)
         for candidate in selected
         for name, j in columns_of(simulator.slots, index[candidate.named]).items()
         if (size := candidate.parameters.get(name)) and np.isfinite(size.high - size.low)
     }
+
+
+def _indices(simulator: Simulator) -> dict[Named, int]:
+    return {Named(e.kind, e.target): i for i, e in enumerate(simulator.effects)}
 
 
 def repeatability(
@@ -136,7 +140,7 @@ def _alone(
     grid = grid_for(everything, host)
     simulator = simulator or Simulator(model, make_candidates(model), grid)
     theta = found_theta(simulator, selected)
-    index = {Named(e.kind, e.target): i for i, e in enumerate(simulator.effects)}
+    index = _indices(simulator)
     acting = [index[c.named] for c in selected]
     rivals = {index[named] for named in _rivals(selected, candidates) if named in index}
     skip = [i for i in index.values() if i not in rivals]

@@ -31,6 +31,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import Fit
+from garat_jax.effects import are_exclusive
 
 NEWCOMERS = 2
 """Candidates fitted in an earlier effect's place, of those that screening puts before it by now."""
@@ -120,9 +121,10 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
     found, fitted = [*steps], current
     for place, step in enumerate(steps[:-1]):
         others = [s.effect for s in found if s.effect != step.effect]
-        trials = []
+        trials, laws = [], problem.simulator.effects
         for candidate, contender in step.alike:
-            if contender.score.effect not in others:
+            own = laws[contender.score.effect]
+            if not any(are_exclusive(own, laws[other]) for other in others):
                 trial = under_another_name(problem, fitted, step.contender, contender)
                 if trial is None:
                     say(f"trying {candidate.named} instead of {step.candidate.named}")

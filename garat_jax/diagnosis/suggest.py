@@ -48,10 +48,13 @@ def suggest(
 
 def _may_answer(effect: Effect) -> bool:
     """Say whether an effect has suggestions at all."""
-    return any(
-        getattr(type(effect), name).__func__ is not getattr(Effect, name).__func__
-        for name in ("suggested", "suggested_by_commands")
-    )
+    names = ("suggested", "suggested_by_commands")
+    own, none = ([_code(getattr(cls, name)) for name in names] for cls in (type(effect), Effect))
+    return own != none
+
+
+def _code(method) -> object:
+    return getattr(method, "__func__", method)
 
 
 def _suggestion(effect: Effect, missing: MissingTorque, torques) -> Suggestion | None:

@@ -8,6 +8,7 @@ import numpy as np
 from garat_jax.diagnosis.differences import is_erratic, typical_size
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.simulate import Simulator, columns_of
+from garat_jax.effects import are_exclusive
 
 UNEVEN = 2.5
 """Norm of a change, relative to its typical size, from which a larger step is tried, too: a sine
@@ -66,7 +67,7 @@ def firsts(problem: Problem[Simulator], theta: np.ndarray, skip) -> tuple[list[R
     for index in range(len(simulator.effects)):
         names = columns_of(simulator.slots, index)
         columns = list(names.values())
-        taken = any(simulator.effects[index].excludes(other) for other in acting)
+        taken = any(are_exclusive(simulator.effects[index], other) for other in acting)
         if index in skip or taken or not columns:
             continue
         has_one = problem.num_listed(index) == 1

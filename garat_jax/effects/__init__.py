@@ -3,7 +3,15 @@
 from collections.abc import Iterable
 
 from garat_jax.effects.actuator import BackEmf, MotorCurve, MotorGain, TorqueSaturation
-from garat_jax.effects.base import Effect, ModelView, Parameter, Suggestion, parameter
+from garat_jax.effects.base import (
+    Effect,
+    ModelView,
+    Parameter,
+    Suggestion,
+    are_exclusive,
+    check_together,
+    parameter,
+)
 from garat_jax.effects.body import AirDrag, ComOffset, PayloadMass
 from garat_jax.effects.command import ActuatorDelay, ActuatorLag, MotorDeadband
 from garat_jax.effects.contact import ContactCompliance, ContactFriction
@@ -102,6 +110,8 @@ __all__ = [
     "TorqueOffset",
     "TorqueSaturation",
     "ViscousDamping",
+    "are_exclusive",
+    "check_together",
     "in_order",
     "parameter",
     "parameter_at",

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
@@ -187,11 +187,12 @@ class Effect(abc.ABC):
         return True
 
     def excludes(self, other: "Effect") -> bool:
-        """Say whether a model may have this effect or another, not both: one of a kind at a place.
+        """Say whether a model may have this effect or another, of another kind or place, not both.
 
-        What is in a model already, and what is added, is checked by it.
+        See `are_exclusive`.
         """
-        return (self.kind, self.target) == (other.kind, other.target)
+        del other
+        return False
 
     def check(self, host: mujoco.MjModel) -> None:
         """Check the target against a model.
@@ -365,3 +366,28 @@ class Effect(abc.ABC):
     def along_path(self) -> "Effect":
         """Return an effect without `tune` that does the same to first order along a given path."""
         return self
+
+
+def are_exclusive(one: Effect, other: Effect) -> bool:
+    """Say whether a model may have one of two effects only: of a kind there is one at a place."""
+    if (one.kind, one.target) == (other.kind, other.target):
+        return True
+    return one.excludes(other) or other.excludes(one)
+
+
+def check_together(effects: Sequence[Effect]) -> None:
+    """Check that a model may have all of some effects.
+
+    Raises:
+        UserError: Two of them are exclusive.
+    """
+    for number, effect in enumerate(effects):
+        for other in effects[:number]:
+            if not are_exclusive(effect, other):
+                continue
+            if effect.kind == other.kind and effect.target == other.target:
+                raise UserError(f"{effect.kind} is at {effect.target} twice; write it once")
+            raise UserError(
+                f"{other.kind} at {other.target} and {effect.kind} at {effect.target} exclude each "
+                "other; write one of them"
+            )

@@ -147,7 +147,7 @@ def test_one_gear_is_between_a_motor_and_its_joint(tmp_path, capsys):
     card = str(save_card(tmp_path / "arm.toml", model, [Backlash("joint/elbow", gap=0.01)]))
     arguments = ["joint_flexibility", "--at", "joint/elbow", "--set", "stiffness=20"]
     assert cli.main(["add", card, *arguments, "--out", str(tmp_path / "both.toml")]) == 2
-    said = "has backlash at joint/elbow already; it is that or joint_flexibility there"
+    said = "has backlash at joint/elbow already; it is that or joint_flexibility at joint/elbow"
     assert said in capsys.readouterr().err
     for name, is_offered in (("arm.xml", True), ("arm.toml", False)):
         offered = make_candidates(load_model(tmp_path / name))

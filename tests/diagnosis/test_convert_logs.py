@@ -223,7 +223,11 @@ def test_a_bag_damaged_after_its_beginning_is_refused(tmp_path, capsys, kept):
         ("/joint_states.pos", "/joint_state.pos", "unknown topic '/joint_state'; did you mean"),
         (".position[", ".positon[", "unknown field of /joint_states 'positon'; did you mean"),
         ("[hinge]", "[hing]", "unknown name in /joint_states 'hing'; did you mean hinge?"),
-        ("velocity[1]", "velocity[2]", "velocity has 2 elements, so it has no [2]"),
+        (
+            "velocity[1]",
+            "velocity[2]",
+            "no message of /joint_states has an element [2] of velocity",
+        ),
         ("[hinge]", "", "is no number; name one of its elements"),
         ("/effort.data", "effort", "'effort' names no field of a topic; expected /TOPIC.FIELD"),
     ],

@@ -149,7 +149,7 @@ def test_card_elsewhere_is_refused(tmp_path):
         (
             "[[effect]]",
             GEARS + "[[effect]]",
-            "backlash and joint_flexibility are both at joint/elbow, where one of them can be only",
+            "backlash at joint/elbow and joint_flexibility at joint/elbow exclude each other",
         ),
     ],
 )

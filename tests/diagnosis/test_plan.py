@@ -1,5 +1,7 @@
 """`garat plan`: within the limits, and better at telling effects apart than a plain sine."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pandas as pd
@@ -8,6 +10,7 @@ import pytest
 from garat_jax import cli
 from garat_jax.diagnosis import load_model
 from garat_jax.diagnosis.plan import Place, _Judge, parse_place, plan
+from garat_jax.effects import Backlash
 from garat_jax.errors import UserError
 from tests import models
 
@@ -175,6 +178,15 @@ def test_slow_actuators_are_followed_from_rest_under_the_commands_that_are_playe
     assert followed.shape == (300, 2)
     np.testing.assert_allclose(followed[:100], 0.0, atol=1e-9)
     assert followed[110, 0] > 1e-3
+
+
+def test_places_that_an_effect_of_the_card_excludes_are_refused(tmp_path):
+    (tmp_path / "arm.xml").write_text(models.ARM)
+    model = load_model(tmp_path / "arm.xml")
+    model = dataclasses.replace(model, effects=(Backlash("joint/elbow", gap=0.01),))
+    assert parse_place("backlash@joint/elbow", model).kind == "backlash"
+    with pytest.raises(UserError, match="exclude each other; write one of them"):
+        parse_place("joint_flexibility@joint/elbow", model)
 
 
 def test_a_body_that_an_effect_of_the_card_adds_is_no_place(pendulum):

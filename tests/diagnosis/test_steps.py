@@ -128,6 +128,14 @@ def test_an_effect_gives_way_to_what_comes_first_only_beside_what_was_found_sinc
     assert current.theta[DRAG] == 0.0
 
 
+def test_an_effect_does_not_give_way_to_what_another_excludes(problem, monkeypatch):
+    monkeypatch.setattr(
+        ViscousDamping, "excludes", lambda self, other: other.kind == "torque_offset"
+    )
+    steps, *_ = reconsidered(problem, DRAG, DAMPING, OFFSET)
+    assert steps[0].effect != DAMPING and steps[1].effect == OFFSET
+
+
 def test_what_only_made_up_for_the_wrong_effect_goes_with_it(problem):
     steps, current, before = reconsidered(problem, DRAG, DAMPING, OFFSET, GAIN)
     assert [step.effect for step in steps] == [DAMPING, OFFSET]

@@ -12,12 +12,14 @@ from garat_jax.diagnosis import load_model
 from garat_jax.diagnosis.add import add
 from garat_jax.diagnosis.diagnose import make_candidates
 from garat_jax.diagnosis.own_effects import asked, check_identity
+from garat_jax.diagnosis.suggest import suggest
 from garat_jax.diagnosis.view import repaired
 from garat_jax.dynamics import Override, compile
-from garat_jax.effects import CATALOGUE
+from garat_jax.effects import CATALOGUE, ViscousDamping, check_together
 from garat_jax.effects.catalogue import load_catalogue
 from garat_jax.errors import UserError
 from tests import models
+from tests.diagnosis import pendulum
 from tests.diagnosis.test_diagnosis_report import FRICTION
 
 MINE = '''
@@ -190,6 +192,8 @@ def test_what_fields_returns_is_checked(mine, old, new, said):
     [
         ("starts(cls, host, target)", "return ()", "line 25): starts lists no size"),
         ("starts(cls, host, target)", "return ({'stifness': 1.0},)", "did you mean stiffness"),
+        ("starts(cls, host, target)", "return ({'stiffness': '1'},)", "stiffness = '1', not a"),
+        ("beside(cls, start, given)", "return start.stifness", "line 27): AttributeError"),
         ("starts(cls, host, target)", "return 1 / 0", "line 27): ZeroDivisionError"),
         ("at(cls, host, target)", "return {'stifness': 0.0}", "unexpected keyword argument"),
         ("fits(cls, host, element, name)", "return host.name", "line 27): AttributeError"),
@@ -210,7 +214,10 @@ def test_what_tells_places_and_sizes_is_checked_before_a_diagnosis(mine, method,
     [
         ("return [0.5]", "line 25): suggested returns something else than a Suggestion or None"),
         ("return Suggestion(({'stifness': 1.0},), 1)", "did you mean stiffness"),
-        ("return Suggestion((), 1)", "line 25): suggested lists no size"),
+        ("return Suggestion(({'stiffness': None},), 1)", "suggested has stiffness = None, not a"),
+        ("return Suggestion(({'stiffness': -1},), 1)", "stiffness = -1, not a number from 0 to"),
+        ("return Suggestion((0.5,), 1)", "suggested lists something else than parameters by name"),
+        ("return Suggestion((), None)", "suggested returns something else than a Suggestion"),
         ("return torque / 'N m'", "line 27): "),
     ],
 )
@@ -224,6 +231,37 @@ def test_what_a_law_suggests_is_checked(mine, body, said):
     (line,) = str(caught.value).splitlines()
     assert line.startswith(f"effect my_spring ({mine}")
     assert said in line
+
+
+@pytest.mark.parametrize("head", ["@classmethod\n    ", ""])
+def test_a_law_may_have_nothing_to_suggest(mine, head):
+    text = MINE.replace("import Effect", "import Effect, Suggestion")
+    method = "def suggested(cls, position, torque, rests):\n        return Suggestion((), 0)\n"
+    mine.write_text(f"{text}\n    {head}{method}")
+    spring = load_catalogue([mine])["my_spring"](target="joint/hinge")
+    spec = models.spec(models.PENDULUM)
+    (found,) = suggest([spring], spec.compile(), [pendulum.record(lambda spec: None, 0)]).values()
+    assert found.starts == ()
+
+
+def test_what_excludes_an_effect_is_excluded_by_it(mine):
+    rule = "return other.kind == 'viscous_damping' and other.target == self.target"
+    mine.write_text(f"{MINE}\n    def excludes(self, other):\n        {rule}\n")
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    spring = model.catalogue["my_spring"](target="joint/hinge", stiffness=1.0)
+    beside = make_candidates(dataclasses.replace(model, effects=(spring,)))
+    places = [(e.kind, e.target) for e in beside]
+    assert ("viscous_damping", "joint/hinge") not in places
+    assert ("my_spring", "joint/hinge") not in places
+    assert ("coulomb_friction", "joint/hinge") in places
+    both = [spring, ViscousDamping("joint/hinge")]
+    for effects in (both, both[::-1]):
+        with pytest.raises(UserError, match="exclude each other; write one of them"):
+            check_together(effects)
+    mine.write_text(f"{MINE}\n    def excludes(self, other):\n        return other.knd\n")
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    with pytest.raises(UserError, match=r"line 26\): AttributeError"):
+        make_candidates(model)
 
 
 @pytest.mark.parametrize("kind", CATALOGUE)

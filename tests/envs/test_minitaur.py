@@ -10,6 +10,7 @@ import pytest
 
 from garat_jax import dynamics
 from garat_jax.dynamics import Override
+from garat_jax.effects import Backlash, JointFlexibility
 from garat_jax.env import make_world
 from garat_jax.envs import minitaur, minitaur_motors
 from garat_jax.envs.minitaur import Minitaur
@@ -173,6 +174,12 @@ def test_the_measured_curve_is_below_the_line_beyond_its_first_point():
     current = minitaur_motors.CURRENTS[2:]
     line = minitaur_motors.TORQUE_CONSTANT * current
     assert (np.asarray(minitaur_motors.torque_of(jnp.asarray(current))) < line).all()
+
+
+def test_effects_that_exclude_each_other_are_no_world():
+    joint = f"joint/{make_world(Minitaur(), engine='mujoco').params.host.model.joint(0).name}"
+    with pytest.raises(UserError, match="exclude each other; write one of them"):
+        make_world(Minitaur(), effects=(Backlash(joint), JointFlexibility(joint)), engine="mujoco")
 
 
 def test_a_model_whose_control_steps_last_otherwise_is_refused():
