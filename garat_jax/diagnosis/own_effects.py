@@ -26,9 +26,10 @@ TRIALS, STEPS = 8, 3
 """States that a law without effect is tried at, and commands in a row at each."""
 
 
-def is_own(effect: Effect) -> bool:
-    """Say whether an effect is none of the built-in catalogue."""
-    return type(effect) is not CATALOGUE.get(effect.kind)
+def is_own(effect: Effect | type[Effect]) -> bool:
+    """Say whether an effect, or a kind of effect, is none of the built-in catalogue."""
+    cls = effect if isinstance(effect, type) else type(effect)
+    return cls is not CATALOGUE.get(cls.kind)
 
 
 def everywhere(cls: type[Effect], host: mujoco.MjModel) -> list[Effect]:
@@ -42,11 +43,10 @@ def everywhere(cls: type[Effect], host: mujoco.MjModel) -> list[Effect]:
         UserError: It is a user's own, and fails at that or at telling sizes to try.
     """
     made: list[Effect] = []
-    is_built_in = cls is CATALOGUE.get(cls.kind)
-    with contextlib.nullcontext() if is_built_in else _named(cls):
+    with _named(cls) if is_own(cls) else contextlib.nullcontext():
         for target in cls.targets(host):
             made.append(cls(target=target, **cls.at(host, target)))
-            if not is_built_in:
+            if is_own(cls):
                 _check_choices(made[-1], host)
     return made
 

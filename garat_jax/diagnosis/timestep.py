@@ -41,8 +41,9 @@ LOST = 10.0
 """Cost of a segment, relative to noise's and to the median segment's, above which its initial state
 was not found."""
 SETTLED = 0.4
-"""What a finer timestep changes, in half-widths of the interval, below which no still finer one is
-tried: a timestep of 0 changes a third of that."""
+"""What a finer timestep changes, in half-widths of the fit's own interval, below which no still
+finer one is tried: a timestep of 0 changes a third of that. Wide differences make the interval that
+is given wider, but not the estimate better."""
 
 
 def count_timestep(problem: Problem, fitted: Fit, num_refitted: int = REFITTED) -> Fit:
@@ -197,8 +198,8 @@ def _at_finer_timesteps(
         near, lin, rough = _at_minimum(some, near, differences)
         relative, change = differences.relative, (near.theta - before.theta)[free]
         low, high = _interval(some, near.theta, near, lin, rough)
-        half = (high - low) / 2
-        if np.all(np.abs(change) <= SETTLED * half):
+        half, of_fit = (high - low) / 2, np.hypot((near.high - near.low) / 2, rough)
+        if np.all(np.abs(change) <= SETTLED * of_fit):
             break
     half = np.maximum(half, half_before)
     is_told = np.isfinite(half)
