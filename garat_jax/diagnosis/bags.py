@@ -118,12 +118,14 @@ def _rows(
                 except _NotInMessageError as error:
                     others.setdefault(text, set()).update(error.names)
                     if error.counted is not None:
-                        counted[text].append((time, error.counted))
+                        counted[text].append((time, _number(error.counted, source)))
     for text, source in wanted.items():
         found[text] = found[text] or counted[text]
         if text in others and not found[text] and str(source.element).isdigit():
             what = f"no message of {source.topic} has an element [{source.element}]"
             raise UserError(f"{what} of {source.field}, by name or by number")
+        if text in others and not found[text] and not others[text]:
+            raise UserError(f"{source.topic} names no elements, so it has no [{source.element}]")
         if text in others and not found[text]:
             raise unknown_name(f"name in {source.topic}", str(source.element), sorted(others[text]))
     return found
@@ -134,11 +136,11 @@ class _NotInMessageError(Exception):
 
     Attributes:
         names: Those that it has.
-        counted: The value at the place that the element is, if that is a number; None else, and
+        counted: What stands at the place that the element is, if that is a number; None else, and
             where there is no such place.
     """
 
-    def __init__(self, names: set[str], counted: float | None):
+    def __init__(self, names: set[str], counted: Any):
         super().__init__(names)
         self.names, self.counted = names, counted
 
@@ -185,6 +187,10 @@ def _value(message: Any, source: Source) -> float:
         value = fields[name]
     if source.element is not None:
         value = _element(value, owner, source)
+    return _number(value, source)
+
+
+def _number(value: Any, source: Source) -> float:
     if not np.ndim(value) == 0 or not isinstance(value, int | float | np.number | np.bool_):
         raise UserError(
             f"{source.topic}.{source.field} is no number; name one of its elements, such as "
@@ -199,11 +205,11 @@ def _element(values: Any, owner: Any, source: Source) -> Any:
     if np.ndim(values) != 1:
         raise UserError(f"{source.topic}.{source.field} is no array, so it has no [{element}]")
     names = list(_fields(owner).get("name", ()))
-    index = names.index(element) if element in names else int(element) if element.isdigit() else -1
-    is_there = 0 <= index < len(values)
-    if names and element not in names:
-        raise _NotInMessageError(set(names), float(values[index]) if is_there else None)
-    if not is_there:
+    if element not in names:
+        place = int(element) if element.isdigit() else len(values)
+        raise _NotInMessageError(set(names), values[place] if place < len(values) else None)
+    index = names.index(element)
+    if index >= len(values):
         raise UserError(
             f"{source.topic}.{source.field} has {len(values)} elements, so it has no [{element}]"
         )

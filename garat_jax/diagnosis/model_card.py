@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from garat_jax.diagnosis.own_effects import try_own
+from garat_jax.diagnosis.own_effects import try_choices, try_own
 from garat_jax.dynamics import Dynamics, Override, compile
 from garat_jax.effects import CATALOGUE, Effect, check_together
 from garat_jax.effects.bounds import check_bounds
@@ -140,10 +140,11 @@ def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
         overrides = tuple(_override(table) for table in _tables(card, "override"))
         effects = tuple(_effect(table, catalogue) for table in _tables(card, "effect"))
         host = compile(spec, overrides, engine="mujoco").host.model
-        check_together(effects)
         for effect in effects:
             effect.check(host)
             check_bounds(effect, host)
+        try_choices(effects, host)
+        check_together(effects)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     return Model(path.stem, path, mjcf, spec, overrides, effects, catalogue)

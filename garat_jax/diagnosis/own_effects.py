@@ -75,6 +75,17 @@ def try_own(
             check_identity(alone.host, type(effect), effect.target)
 
 
+def try_choices(effects: Sequence[Effect], host: mujoco.MjModel) -> None:
+    """Ask each effect of the user's own for sizes to try it at, and what it excludes.
+
+    Raises:
+        UserError: One fails at that, or tells no sizes.
+    """
+    for effect in filter(is_own, effects):
+        with _named(effect):
+            _check_choices(effect, host)
+
+
 def asked(effect: Effect, method: str, *seen: Any) -> Suggestion | None:
     """Return what an effect's `suggested` or `suggested_by_commands` says of what was seen.
 
@@ -88,8 +99,13 @@ def asked(effect: Effect, method: str, *seen: Any) -> Suggestion | None:
         answer = suggest(*seen)
         if answer is None:
             return None
-        if not isinstance(answer, Suggestion) or not isinstance(answer.num_tried, int | np.integer):
+        if not isinstance(answer, Suggestion):
             what = f"{method} returns something else than a Suggestion or None"
+            raise _mistake(effect, method, what)
+        if not isinstance(answer.num_tried, int | np.integer) or answer.num_tried < 0:
+            what = (
+                f"{method} has num_tried = {answer.num_tried!r}; expected how many were looked at"
+            )
             raise _mistake(effect, method, what)
         _check_sizes(effect, method, answer.starts)
         return answer
@@ -169,12 +185,13 @@ def _done_by(dynamics: Dynamics, qpos: jax.Array, qvel: jax.Array, ctrl: jax.Arr
 
 def _check_choices(effect: Effect, host: mujoco.MjModel) -> None:
     """Refuse sizes to try an effect at that are none; call what else is asked of it on the way."""
-    effect.excludes(effect)
+    for cls in CATALOGUE.values():
+        effect.excludes(cls(target=effect.target))
     if not effect.parameters():
         return
     sizes = effect.starts(host, effect.target)
     _check_sizes(effect, "starts", sizes)
-    if not sizes or not all(sizes):
+    if not sizes:
         raise _mistake(effect, "starts", "starts lists no size at which to try it")
     for size in sizes:
         effect.beside(size, size)
@@ -185,6 +202,8 @@ def _check_sizes(effect: Effect, method: str, sizes: Any) -> None:
     known = {p.name: p for p in effect.parameters()}
     if not isinstance(sizes, tuple | list) or not all(isinstance(s, Mapping) for s in sizes):
         raise _mistake(effect, method, f"{method} lists something else than parameters by name")
+    if not all(sizes):
+        raise _mistake(effect, method, f"{method} lists a size without parameters")
     for name, value in ((name, value) for size in sizes for name, value in size.items()):
         if name not in known:
             what = str(unknown_name("parameter", name, known))

@@ -23,7 +23,7 @@ from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import native_model
-from garat_jax.effects import check_together
+from garat_jax.effects import are_exclusive
 from garat_jax.effects.catalogue import choose_kind
 from garat_jax.effects.elements import element_names
 from garat_jax.errors import UserError, unknown_name
@@ -118,8 +118,12 @@ def parse_place(text: str, model: Model) -> Place:
         raise unknown_name(f"target of {kind}", target, targets)
     place = Place(kind, target or targets[0])
     for present in model.effects:
-        if Place(present.kind, present.target) != place:  # one of the card may be another size
-            check_together((present, cls(target=place.target)))
+        is_same = (present.kind, present.target) == place  # then another size is looked for
+        if not is_same and are_exclusive(present, cls(target=place.target)):
+            raise UserError(
+                f"{model.path} has {present.kind} at {present.target}, which excludes {text}; plan "
+                "with the model without it"
+            )
     return place
 
 

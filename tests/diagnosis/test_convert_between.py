@@ -38,7 +38,8 @@ def test_a_quaternion_whose_sign_flips_stays_of_length_1(tmp_path):
 @pytest.mark.parametrize("name", ["hinge", "1"])
 def test_joints_that_share_a_topic_with_others_are_read(tmp_path, name):
     def by_turns(k):
-        return ([name], [ANGLE[k]]) if k % 2 else (["gripper", "finger"], [0.0, 0.0])
+        others = (["gripper", "finger"], [0.0, 0.0]), ([], []), ([], [0.0, 0.0])
+        return ([name], [ANGLE[k]]) if k % 2 else others[k // 2 % 3]
 
     made = read_between(tmp_path, by_turns, AT_HINGE.replace("[hinge]", f"[{name}]"))
     at = 0.014 + np.arange(len(made)) / RATE

@@ -58,13 +58,26 @@ def test_the_ladder_falls_to_the_floor(improved):
     assert "+ coulomb_friction at joint/hinge (torque 0.07" in str(done)
 
 
-def test_a_drift_that_the_later_rounds_explain_is_not_said(improved):
+CHANGE = Estimate(0.1, 0.05, 0.15, "N m")
+DRIFT = Drift("coulomb_friction", "joint/hinge", "torque", 0.1, 0.2, CHANGE, 0.001, 0.5)
+
+
+def test_a_drift_is_printed_and_written(improved):
+    done = improved[2]
+    drifting = dataclasses.replace(
+        done, diagnosis=dataclasses.replace(done.diagnosis, drifts=(DRIFT,))
+    )
+    assert "\n  drift: torque of coulomb_friction" in str(drifting)
+    (written,) = drifting.to_json()["drifts"]
+    assert written["parameter"] == "torque"
+
+
+def test_a_drift_that_the_later_rounds_explain_is_not_said(improved, monkeypatch):
     """What drifts is found beside all effects that were added, not beside those of one round."""
+    monkeypatch.setattr("garat_jax.diagnosis.improve.is_above", lambda *_: True)
     made, _, done = improved
-    change = Estimate(0.1, 0.05, 0.15, "N m")
-    drift = Drift("coulomb_friction", "joint/hinge", "torque", 0.1, 0.2, change, 0.001, 0.5)
     first, last = done.rounds
-    rounds = [dataclasses.replace(first, drifts=(drift,)), last]
+    rounds = [dataclasses.replace(first, drifts=(DRIFT,)), last]
     model = load_model(made.fit[0].parent.parent / "pendulum.xml", FEW)
     recordings = read_recordings(model, (*made.fit, *made.holdout))
     assert _as_one(model, recordings, (), rounds, first.selected).drifts == ()

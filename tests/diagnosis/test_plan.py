@@ -185,7 +185,7 @@ def test_places_that_an_effect_of_the_card_excludes_are_refused(tmp_path):
     model = load_model(tmp_path / "arm.xml")
     model = dataclasses.replace(model, effects=(Backlash("joint/elbow", gap=0.01),))
     assert parse_place("backlash@joint/elbow", model).kind == "backlash"
-    with pytest.raises(UserError, match="exclude each other; write one of them"):
+    with pytest.raises(UserError, match="which excludes joint_flexibility@joint/elbow; plan"):
         parse_place("joint_flexibility@joint/elbow", model)
 
 

@@ -193,6 +193,7 @@ def test_what_fields_returns_is_checked(mine, old, new, said):
         ("starts(cls, host, target)", "return ()", "line 25): starts lists no size"),
         ("starts(cls, host, target)", "return ({'stifness': 1.0},)", "did you mean stiffness"),
         ("starts(cls, host, target)", "return ({'stiffness': '1'},)", "stiffness = '1', not a"),
+        ("starts(cls, host, target)", "return ({},)", "starts lists a size without parameters"),
         ("beside(cls, start, given)", "return start.stifness", "line 27): AttributeError"),
         ("starts(cls, host, target)", "return 1 / 0", "line 27): ZeroDivisionError"),
         ("at(cls, host, target)", "return {'stifness': 0.0}", "unexpected keyword argument"),
@@ -217,7 +218,9 @@ def test_what_tells_places_and_sizes_is_checked_before_a_diagnosis(mine, method,
         ("return Suggestion(({'stiffness': None},), 1)", "suggested has stiffness = None, not a"),
         ("return Suggestion(({'stiffness': -1},), 1)", "stiffness = -1, not a number from 0 to"),
         ("return Suggestion((0.5,), 1)", "suggested lists something else than parameters by name"),
-        ("return Suggestion((), None)", "suggested returns something else than a Suggestion"),
+        ("return Suggestion(({},), 1)", "suggested lists a size without parameters"),
+        ("return Suggestion((), None)", "suggested has num_tried = None; expected how many"),
+        ("return Suggestion((), -1)", "suggested has num_tried = -1; expected how many"),
         ("return torque / 'N m'", "line 27): "),
     ],
 )
@@ -258,10 +261,15 @@ def test_what_excludes_an_effect_is_excluded_by_it(mine):
     for effects in (both, both[::-1]):
         with pytest.raises(UserError, match="exclude each other; write one of them"):
             check_together(effects)
-    mine.write_text(f"{MINE}\n    def excludes(self, other):\n        return other.knd\n")
+    mine.write_text(f"{MINE}\n    def excludes(self, other):\n        return other.stiffness > 0\n")
     model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
     with pytest.raises(UserError, match=r"line 26\): AttributeError"):
         make_candidates(model)
+    card = mine.parent / "card.toml"
+    spring = 'kind = "my_spring"\ntarget = "joint/hinge"\nparameters = { stiffness = 1.0 }\n'
+    card.write_text(f'format = "garat-model/1"\nmjcf = "pendulum.xml"\n[[effect]]\n{spring}')
+    with pytest.raises(UserError, match=r"line 26\): AttributeError"):
+        load_model(card, load_catalogue([mine]))
 
 
 @pytest.mark.parametrize("kind", CATALOGUE)
