@@ -109,10 +109,26 @@ def test_forces_follow_their_laws():
 def test_dry_friction_has_the_size_of_its_law():
     numbers = {"coulomb": 0.1, "static": 0.3, "velocity": 0.5}
     stribeck, scene = made("stribeck_friction", "arm2", "joint/elbow", **numbers)
-    model = truth_model(stribeck, scene)
     for speed, size in ((0.0, 0.3), (0.5, 0.1 + 0.2 * np.exp(-1)), (50.0, 0.1)):
+        model = truth_model(stribeck, scene)
         added_force(stribeck, scene, [0.0, speed], model)
         assert model.dof_frictionloss[1] == pytest.approx(size)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0)])
+def test_dry_frictions_of_a_joint_add_up(order):
+    level = {"coulomb": 0.02, "static": 0.02, "velocity": 0.5}
+    stribeck, scene = made("stribeck_friction", "arm2", "joint/elbow", **level)
+    coulomb, _ = made("coulomb_friction", "arm2", "joint/elbow", torque=0.03)
+    sides = {"coulomb_positive": 0.05, "coulomb_negative": 0.05}
+    sides |= {"viscous_positive": 0.0, "viscous_negative": 0.0}
+    asymmetric, _ = made("asymmetric_friction", "arm2", "joint/elbow", **sides)
+    whole, _ = made("coulomb_friction", "arm2", "joint/elbow", torque=0.1)
+    time, ctrl = experiment(scene, 0, 200.0, 0.5, (0,))
+    together = [(stribeck, coulomb, asymmetric)[i] for i in order]
+    clean, added, one = (measure(scene, s, time, ctrl, 0.0) for s in ((), together, (whole,)))
+    assert added == pytest.approx(one, abs=1e-6)
+    assert np.abs(added - clean).max() > 1e-2
 
 
 @pytest.mark.parametrize(

@@ -37,17 +37,19 @@ class CoulombFriction(AtJoint):
 
 
 class VaryingFriction(AtJoint):
-    """Dry friction whose size changes with the motion, as MuJoCo's constraint of that size."""
+    """Dry friction whose size changes with the motion, as MuJoCo's constraint of that size.
+
+    It is added to other dry friction of the joint.
+    """
 
     def change(self, spec, scene):
-        spec.joint(self.name).frictionloss = SMALLEST_FRICTION
+        spec.joint(self.name).frictionloss += SMALLEST_FRICTION
 
     def act(self, model, scene):
         dof = int(model.joint(self.name).dofadr[0])
 
         def act(data):
-            size = self.friction(data, dof)
-            model.dof_frictionloss[dof] = max(size, SMALLEST_FRICTION)
+            model.dof_frictionloss[dof] += self.friction(data, dof)
 
         return act
 

@@ -73,8 +73,10 @@ def _combine(secrets: Sequence[Secret], model: mujoco.MjModel, scene: Scene):
     acts = [act for act in (secret.act(model, scene) for secret in secrets) if act]
     if not acts:
         return None
+    constant = model.dof_frictionloss.copy()
 
     def combined(data: mujoco.MjData) -> None:
+        model.dof_frictionloss[:] = constant
         data.qfrc_applied[:] = 0
         data.xfrc_applied[:] = 0
         for act in acts:
