@@ -52,7 +52,8 @@ class Improvement:
 
     Attributes:
         diagnosis: All rounds as one: the first one's view of the model, everything that was added,
-            the ladder over all of it at one horizon, and the last one's verdict on what is left.
+            the ladder over all of it at one horizon, and the last one's verdict on what is left,
+            its warnings, and what the recordings do not show of the repaired model.
         rounds: Each diagnosis, the first of the model as it was.
         model: The repaired model.
     """
@@ -69,6 +70,7 @@ class Improvement:
 
     def __str__(self) -> str:
         lines = [self.diagnosis.sentence]
+        lines += [f"  warning: {warning}" for warning in self.diagnosis.warnings]
         lines += [f"  left: {line}" for line in self.diagnosis.left_lines]
         for rung in self.diagnosis.ladder:
             added = self.diagnosis.added(rung)
@@ -97,6 +99,8 @@ class Improvement:
             "longest",
             "ladder",
             "drifts",
+            "warnings",
+            "unseen",
         )
         return {
             "format": FORMAT,
@@ -169,6 +173,8 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
         drifts=drifts,
         left=last.left if stays else (),
         next_experiment=last.next_experiment or first.next_experiment,
+        warnings=last.warnings,
+        unseen=last.unseen,
     )
 
 

@@ -72,6 +72,18 @@ def test_a_drift_is_printed_and_written(improved):
     assert written["parameter"] == "torque"
 
 
+def test_warnings_are_those_of_the_repaired_model(improved, monkeypatch):
+    done = improved[2]
+    first, last = (dataclasses.replace(r, warnings=(f"of {i}",)) for i, r in enumerate(done.rounds))
+    measured = ((), first.error, None, ())
+    monkeypatch.setattr("garat_jax.diagnosis.improve._ladder", lambda *given: measured)
+    whole = _as_one(done.model, (), (), [first, last], first.selected)
+    warned = dataclasses.replace(done, diagnosis=whole)
+    assert "\n  warning: of 1" in str(warned)
+    assert "of 0" not in str(warned)
+    assert warned.to_json()["warnings"] == ["of 1"]
+
+
 def test_a_drift_that_the_later_rounds_explain_is_not_said(improved, monkeypatch):
     """What drifts is found beside all effects that were added, not beside those of one round."""
     monkeypatch.setattr("garat_jax.diagnosis.improve.is_above", lambda *_: True)
