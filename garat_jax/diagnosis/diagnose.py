@@ -9,9 +9,8 @@ import numpy as np
 
 from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.held_out import (
-    are_explained,
-    errors_of,
-    longest_errors,
+    HeldOut,
+    measure_held_out,
     warn_of_fitted,
     warn_of_timestep,
 )
@@ -30,7 +29,7 @@ from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.own_effects import everywhere
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
-from garat_jax.diagnosis.results import Candidate, Diagnosis, Errors, Rung, Verdict
+from garat_jax.diagnosis.results import Candidate, Diagnosis, Rung, Verdict
 from garat_jax.diagnosis.segments import SHORTEST, grid_for
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
@@ -105,10 +104,10 @@ def diagnose_keeping(
     too_few = few_segments(problem)
     warnings += too_few
     warnings += warn_of_fitted(problem, outcome.before, host) if outcome.adequate else ()
-    error = errors_of(problem, (outcome.before, outcome.after), outcome.floor, host, how)
-    if not error.is_too_coarse:
+    fits = outcome.before, outcome.after
+    measured = measure_held_out(problem, fits, outcome.floor, everything, grid, how)
+    if not measured.error.is_too_coarse:
         warnings += warn_of_timestep(problem, outcome.floor, host)
-    longest = longest_errors(problem, outcome.after.theta, everything, grid, host, how)
     first = [c for c in outcome.candidates[:1] if c.why != NIL]
     explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
     found = Diagnosis(
@@ -117,9 +116,8 @@ def diagnose_keeping(
         holdout=tuple(r.name for r in held_out),
         versions=versions(),
         seconds=0.0,
-        verdict=verdict_of(outcome.adequate, outcome.selected, error, longest),
-        error=error,
-        longest=longest,
+        verdict=verdict_of(outcome.adequate, outcome.selected, measured),
+        **measured._asdict(),
         where=tuple(localise(missing_torque(host, everything, world))),
         candidates=outcome.candidates,
         selected=outcome.selected,
@@ -224,20 +222,18 @@ def few_segments(problem: Problem) -> tuple[str, ...]:
     )
 
 
-def verdict_of(
-    adequate: bool, selected: Sequence[Candidate], error: Errors, longest: Errors | None
-) -> Verdict:
+def verdict_of(adequate: bool, selected: Sequence[Candidate], measured: HeldOut) -> Verdict:
     """Return the verdict.
 
     Args:
         adequate: Whether the model as it is comes near the noise in what was fitted.
         selected: What was found.
-        error: The held-out errors with it.
-        longest: The same over the longest segments; see `longest_errors`.
+        measured: The held-out errors with it.
     """
-    if adequate and not error.is_too_coarse:
+    if adequate and not measured.error.is_too_coarse:
+        longest = measured.longest
         return "adequate" if longest is None or longest.is_adequate else "unexplained"
-    return "missing_effect" if selected and are_explained(error, longest) else "unexplained"
+    return "missing_effect" if selected and measured.are_explained else "unexplained"
 
 
 def _ladder(problem: Problem, outcome: Outcome) -> tuple[Rung, ...]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -22,16 +23,65 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle
+from garat_jax.diagnosis.timestep import REFINEMENTS, refined
 
 COARSE = 3.0
 """The timestep's error, in standard deviations of a signal's noise, that a warning is given of."""
+
+
+class HeldOut(NamedTuple):
+    """The errors that are reported.
+
+    Attributes:
+        error: Over the segments that were fitted, at the model's timestep.
+        longest: Over the longest segments; see `longest_errors`.
+        finer: At a finer timestep; see `finer_errors`.
+    """
+
+    error: Errors
+    longest: Errors | None = None
+    finer: Errors | None = None
+
+    @property
+    def are_explained(self) -> bool:
+        """Whether what was found explains the errors, all that were measured."""
+        return all(errors is None or errors.is_explained for errors in self)
+
+
+def measure_held_out(
+    problem: Problem,
+    fits: tuple[Fit, Fit],
+    floor: Floor,
+    recordings: Sequence[Recording],
+    grid: Grid,
+    how: str,
+) -> HeldOut:
+    """Return the held-out errors of the model as it is and with what was found.
+
+    Those at a finer timestep are measured where something was found that explains the others, and
+    the integrator's error is above the noise.
+
+    Args:
+        problem: The recordings, cut as they were fitted.
+        fits: The two, initial states settled.
+        floor: What noise and the integrator's error make.
+        recordings: What was measured.
+        grid: The simulated steps.
+        how: Names the recordings that are held out.
+    """
+    after = fits[1]
+    error = errors_of(problem, fits, floor, how)
+    found = HeldOut(error, longest_errors(problem, after.theta, recordings, grid, how))
+    is_found = np.any(after.theta != problem.simulator.base)
+    if not (is_found and error.is_coarse and found.are_explained):
+        return found
+    return found._replace(finer=finer_errors(problem, after, how))
 
 
 def errors_of(
     problem: Problem,
     fits: tuple[Fit, Fit],
     floor: Floor,
-    host: mujoco.MjModel,
     how: str,
     above: Callable[[Problem, Metric, Fit, Floor], np.ndarray] = signals_above,
 ) -> Errors:
@@ -41,12 +91,11 @@ def errors_of(
         problem: The recordings, cut.
         fits: The two, initial states settled.
         floor: What noise and the integrator's error make; see `metric.noise_floor`.
-        host: The compiled model.
         how: Names the recordings that are held out.
         above: Which signals count as well above their floor, [num_signals].
     """
     metric, held_out = make_metric(problem), ~problem.fitted
-    noise, listed = problem.segments.noise, signals(host)
+    noise, listed = problem.segments.noise, signals(problem.simulator.host)
     sizes = [*(metric.rms(fit.residual, held_out) for fit in fits), floor.rms]
     named = ("before", "after", "noise_floor")
     per_signal = {
@@ -74,7 +123,6 @@ def longest_errors(
     theta: np.ndarray,
     recordings: Sequence[Recording],
     grid: Grid,
-    host: mujoco.MjModel,
     how: str,
 ) -> Errors | None:
     """Return the errors over the longest segments within which small changes do not grow.
@@ -87,7 +135,6 @@ def longest_errors(
         theta: Parameters with what was found, [num_parameters].
         recordings: What was measured.
         grid: The simulated steps.
-        host: The compiled model.
         how: Names the recordings that are held out.
 
     Returns:
@@ -102,8 +149,33 @@ def longest_errors(
     after = settle(longer, theta, after.start)
     before = settle(longer, longer.simulator.base, longer.segments.start)
     floor = noise_floor(longer, make_metric(longer), after)
-    errors = errors_of(longer, (before, after), floor, host, how, signals_mostly_above)
+    errors = errors_of(longer, (before, after), floor, how, signals_mostly_above)
     return None if errors.is_too_coarse else errors
+
+
+def finer_errors(problem: Problem, after: Fit, how: str, refinements: int = REFINEMENTS) -> Errors:
+    """Return the errors at a finer timestep, down to one whose own error noise hides.
+
+    What stays unexplained may show there alone: at the model's timestep the integrator's error,
+    after impacts most of all, may hide much more than noise does. Physics that is right at any
+    timestep comes down to the noise.
+
+    Args:
+        problem: The recordings, cut as they were fitted.
+        after: The fit of what was found, as a timestep of 0 has it.
+        how: Names the recordings that are held out.
+        refinements: How often the timestep is refined at most.
+    """
+    held_out = np.flatnonzero(~problem.fitted)
+    finer, near = refined(problem.take(held_out), after.take(held_out))
+    finer = trusted(finer, near)
+    near = settle(finer, near.theta, near.start)
+    before = settle(finer, finer.simulator.base, finer.segments.start)
+    floor = noise_floor(finer, make_metric(finer), near)
+    errors = errors_of(finer, (before, near), floor, how, signals_mostly_above)
+    if errors.is_coarse and refinements > 1:
+        return finer_errors(finer, near, how, refinements - 1)
+    return errors
 
 
 def warn_of_timestep(problem: Problem, floor: Floor, host: mujoco.MjModel) -> tuple[str, ...]:
@@ -147,15 +219,11 @@ def warn_of_fitted(problem: Problem, fitted: Fit, host: mujoco.MjModel) -> tuple
     )
 
 
-def are_explained(error: Errors, longest: Errors | None) -> bool:
-    """Return whether what was found explains the errors, over the longest segments too."""
-    return error.is_explained and (longest is None or longest.is_explained)
-
-
 def metric_in_words(problem: Problem, how: str) -> str:
     """Say what the reported errors are; `how` names the recordings."""
     return (
         "root mean square of all signals' prediction errors, each divided by its signal's standard "
         "deviation (where a signal hardly moves, by as many times its noise as is usual of the "
-        f"others), {how}, segments of {problem.horizon:.2g} s"
+        f"others), {how}, segments of {problem.horizon:.2g} s, a timestep of "
+        f"{problem.simulator.host.opt.timestep:.2g} s"
     )

@@ -20,8 +20,8 @@ from garat_jax.diagnosis.conditions import (
 from garat_jax.diagnosis.diagnose import diagnose, few_segments, make_candidates, split, thin
 from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.export import copy_model, needed_files
-from garat_jax.diagnosis.findings import Candidate, Named, apart
-from garat_jax.diagnosis.held_out import are_explained, errors_of, longest_errors
+from garat_jax.diagnosis.findings import Candidate, Drift, Named, apart
+from garat_jax.diagnosis.held_out import HeldOut, measure_held_out
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import is_above, make_metric, noise_floor
@@ -97,6 +97,7 @@ class Improvement:
             "verdict",
             "error",
             "longest",
+            "finer",
             "ladder",
             "drifts",
             "warnings",
@@ -160,14 +161,14 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     first, last = rounds[0], rounds[-1]
     if not added:
         return first
-    ladder, error, longest, drifts = _ladder(model, recordings, holdout, added)
-    stays = last.verdict == "unexplained" and not are_explained(error, longest)
+    ladder, measured, drifts = _ladder(model, recordings, holdout, added)
+    hidden = measured.finer is not None and not measured.finer.is_explained
+    stays = hidden or (last.verdict == "unexplained" and not measured.are_explained)
     verdict: Verdict = "unexplained" if stays else "missing_effect"
     return dataclasses.replace(
         first,
         verdict=verdict,
-        error=error,
-        longest=longest,
+        **measured._asdict(),
         selected=apart(added),
         ladder=ladder,
         drifts=drifts,
@@ -178,12 +179,14 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     )
 
 
-def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
+def _ladder(
+    model: Model, recordings, holdout, added: Sequence[Candidate]
+) -> tuple[tuple[Rung, ...], HeldOut, tuple[Drift, ...]]:
     """Return what the errors of all effects together are, measured at one horizon.
 
     Returns:
-        A rung for each effect, at its final size; the errors at this horizon, and those over the
-        longest segments, as `longest_errors` has them; and which of the sizes drift.
+        A rung for each effect, at its final size; the errors at this horizon, as
+        `measure_held_out` has them; and which of the sizes drift.
     """
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
@@ -206,13 +209,12 @@ def _ladder(model: Model, recordings, holdout, added: Sequence[Candidate]):
         Rung(candidate, metric.error(f.residual, seen), metric.error(f.residual, ~seen))
         for candidate, f in zip((None, *added), fits, strict=True)
     )
-    host, floor = simulator.host, noise_floor(problem, metric, fits[-1])
-    error = errors_of(problem, (fits[0], fits[-1]), floor, host, how)
-    longest = longest_errors(problem, final, everything, grid, host, how)
+    floor = noise_floor(problem, metric, fits[-1])
+    measured = measure_held_out(problem, (fits[0], fits[-1]), floor, everything, grid, how)
     if few_segments(problem) or not is_above(problem, metric, fits[-1], floor):
-        return rungs, error, longest, ()
+        return rungs, measured, ()
     whole = dataclasses.replace(fits[-1], free=tuple(sized_columns(simulator, added)))
-    return rungs, error, longest, find_drifts(problem, whole, everything)
+    return rungs, measured, find_drifts(problem, whole, everything)
 
 
 def run_improve(

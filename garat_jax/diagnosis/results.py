@@ -110,6 +110,11 @@ class Errors:
         return self.integrator > TOO_COARSE
 
     @property
+    def is_coarse(self) -> bool:
+        """Whether the integrator's error is above noise's, so that it hides what noise does not."""
+        return self.integrator > self.noise_floor / math.sqrt(2.0)
+
+    @property
     def is_near_floor(self) -> bool:
         """Whether what is left is what noise, and an integrator that can be trusted, make."""
         return self.after <= ABOVE_FLOOR * self.noise_floor and not self.is_too_coarse
@@ -153,7 +158,9 @@ class Diagnosis:
     stays; errors and candidates are of each condition by itself.
 
     `longest` holds the errors over longer segments than those that were fitted, the longest within
-    which small changes do not grow; None where those fitted are as long.
+    which small changes do not grow; None where those fitted are as long. `finer` holds those at a
+    finer timestep, where the integrator's error hides much at the model's own; None elsewhere, and
+    where nothing was found that could explain the errors.
     """
 
     model: str
@@ -176,6 +183,7 @@ class Diagnosis:
     left: tuple[Place, ...] = ()
     conditions: Mapping[str, "Diagnosis"] = dataclasses.field(default_factory=dict)
     longest: Errors | None = None
+    finer: Errors | None = None
 
     def added(self, rung: Rung) -> str:
         """Say what a rung of the ladder adds, at its final size."""
@@ -293,11 +301,14 @@ class Diagnosis:
 
     @property
     def decisive(self) -> Errors:
-        """The errors that decide: those over the longest segments, where these alone show a gap."""
-        error, longest = self.error, self.longest
-        if longest is None or self.verdict != "unexplained":
-            return error
-        return longest if self._is_right(error) and not self._is_right(longest) else error
+        """The errors that decide.
+
+        Those at a finer timestep, or over the longest segments, where these alone show a gap.
+        """
+        measured = [e for e in (self.error, self.finer, self.longest) if e is not None]
+        if self.verdict != "unexplained":
+            return self.error
+        return next((e for e in measured if not self._is_right(e)), self.error)
 
     def _is_right(self, error: Errors) -> bool:
         """Whether errors alone would say that nothing, or nothing more, is missing."""
@@ -306,8 +317,9 @@ class Diagnosis:
     @property
     def over(self) -> str:
         """Over how long segments the decisive errors are, in words; empty if that is not known."""
-        horizon = self.decisive.horizon
-        return f" over {horizon:.2g} s" if math.isfinite(horizon) else ""
+        error = self.decisive
+        at = f" at a timestep of {error.timestep:.2g} s" if error is self.finer else ""
+        return f" over {error.horizon:.2g} s{at}" if math.isfinite(error.horizon) else ""
 
     @property
     def is_left(self) -> bool:

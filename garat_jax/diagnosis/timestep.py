@@ -234,6 +234,15 @@ def _chosen(problem: Problem, num: int) -> np.ndarray:
     return fitted[is_chosen]
 
 
+def refined(problem: Problem, near: Fit) -> tuple[Problem, Fit]:
+    """Return a problem at a finer timestep, every sample trusted, and a fit settled there."""
+    everything = np.ones_like(problem.segments.trust)
+    segments = dataclasses.replace(problem.segments, trust=everything)
+    simulator = problem.simulator.refined(REFINED)
+    finer = dataclasses.replace(problem, simulator=simulator, segments=segments)
+    return finer, settle_twice(finer, follow(finer, near.theta, near))
+
+
 def _finer(problem: Problem, near: Fit) -> tuple[Problem, Fit]:
     """Return a problem at a finer timestep and a fit's initial states settled there.
 
@@ -241,11 +250,7 @@ def _finer(problem: Problem, near: Fit) -> tuple[Problem, Fit]:
     what was measured, when most do not, are left out: their initial states were not found, on the
     wrong side of a contact.
     """
-    everything = np.ones_like(problem.segments.trust)
-    segments = dataclasses.replace(problem.segments, trust=everything)
-    simulator = problem.simulator.refined(REFINED)
-    finer = dataclasses.replace(problem, simulator=simulator, segments=segments)
-    settled = settle_twice(finer, follow(finer, near.theta, near))
+    finer, settled = refined(problem, near)
     share = settled.cost / finer.expected
     found = np.flatnonzero(share <= LOST * max(1.0, float(np.median(share))))
     finer, settled = finer.take(found), settled.take(found)

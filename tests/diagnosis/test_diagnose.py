@@ -13,6 +13,7 @@ import pytest
 from garat_jax.diagnosis import Recording, compare, diagnose, load_model
 from garat_jax.diagnosis.convert import free_pendulum
 from garat_jax.diagnosis.diagnose import verdict_of
+from garat_jax.diagnosis.held_out import HeldOut
 from garat_jax.diagnosis.hidden import DRAWN, OUTSIDE, make_recordings
 from garat_jax.diagnosis.judge import NIL
 from garat_jax.diagnosis.report import diagnosis_lead
@@ -145,23 +146,24 @@ FOUND = (SimpleNamespace(effect="coulomb_friction"),)
 
 
 @pytest.mark.parametrize(
-    ("adequate", "selected", "error", "longest", "verdict"),
+    ("adequate", "selected", "measured", "verdict"),
     [
-        (True, (), EXPLAINED, None, "adequate"),
-        (True, (), EXPLAINED, EXPLAINED, "adequate"),
-        (True, (), EXPLAINED, LOUD, "unexplained"),
-        (True, (), COARSE, None, "unexplained"),
-        (False, (), EXPLAINED, None, "unexplained"),
-        (False, FOUND, EXPLAINED, None, "missing_effect"),
-        (False, FOUND, EXPLAINED, EXPLAINED, "missing_effect"),
-        (False, FOUND, EXPLAINED, LEFT, "unexplained"),
-        (False, FOUND, LEFT, EXPLAINED, "unexplained"),
+        (True, (), (EXPLAINED,), "adequate"),
+        (True, (), (EXPLAINED, EXPLAINED), "adequate"),
+        (True, (), (EXPLAINED, LOUD), "unexplained"),
+        (True, (), (COARSE,), "unexplained"),
+        (False, (), (EXPLAINED,), "unexplained"),
+        (False, FOUND, (EXPLAINED,), "missing_effect"),
+        (False, FOUND, (EXPLAINED, EXPLAINED, EXPLAINED), "missing_effect"),
+        (False, FOUND, (EXPLAINED, LEFT), "unexplained"),
+        (False, FOUND, (LEFT, EXPLAINED), "unexplained"),
+        (False, FOUND, (EXPLAINED, None, LEFT), "unexplained"),
     ],
 )
-def test_the_longest_segments_have_a_say_in_the_verdict(
-    adequate, selected, error, longest, verdict
+def test_longest_segments_and_a_finer_timestep_have_a_say_in_the_verdict(
+    adequate, selected, measured, verdict
 ):
-    assert verdict_of(adequate, selected, error, longest) == verdict
+    assert verdict_of(adequate, selected, HeldOut(*measured)) == verdict
 
 
 @pytest.mark.slow

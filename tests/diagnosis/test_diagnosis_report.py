@@ -129,6 +129,17 @@ def test_a_gap_that_shows_over_long_segments_alone_is_said_with_their_length():
     assert NOT_ALL.to_json()["longest"]["horizon"] == 2.0
 
 
+def test_a_gap_that_only_a_finer_timestep_shows_is_said_with_it():
+    finer = dataclasses.replace(LONGEST, timestep=0.000125, horizon=0.2)
+    not_all = dataclasses.replace(NOT_ALL, longest=None, finer=finer)
+    assert not_all.decisive is finer
+    assert not_all.sentence.endswith(
+        "10 % of the error over 0.2 s at a timestep of 0.00013 s stays unexplained."
+    )
+    missing = dataclasses.replace(MISSING, finer=finer)
+    assert missing.decisive is missing.error
+
+
 def test_long_segments_that_show_no_gap_do_not_decide():
     right = dataclasses.replace(LONGEST, unexplained_share=0.01)
     not_all = dataclasses.replace(NOT_ALL, longest=right)

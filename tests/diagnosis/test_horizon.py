@@ -62,7 +62,7 @@ def test_a_gap_that_shows_in_long_segments_alone_is_measured_there():
 
     def errors(gain: float) -> Errors | None:
         theta = np.asarray([gain])
-        return longest_errors(problem, theta, recordings, grid, simulator.host, "held out")
+        return longest_errors(problem, theta, recordings, grid, "held out")
 
     right, wrong = errors(GAIN), errors(1.2 * GAIN)
     assert right and wrong

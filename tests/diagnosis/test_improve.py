@@ -10,6 +10,7 @@ import pytest
 from garat_jax.diagnosis import load_model
 from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.findings import Drift, Estimate
+from garat_jax.diagnosis.held_out import HeldOut
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.improve import _as_one, run_improve
 from garat_jax.effects import CATALOGUE
@@ -75,7 +76,7 @@ def test_a_drift_is_printed_and_written(improved):
 def test_warnings_are_those_of_the_repaired_model(improved, monkeypatch):
     done = improved[2]
     first, last = (dataclasses.replace(r, warnings=(f"of {i}",)) for i, r in enumerate(done.rounds))
-    measured = ((), first.error, None, ())
+    measured = ((), HeldOut(first.error), ())
     monkeypatch.setattr("garat_jax.diagnosis.improve._ladder", lambda *given: measured)
     whole = _as_one(done.model, (), (), [first, last], first.selected)
     warned = dataclasses.replace(done, diagnosis=whole)

@@ -10,13 +10,25 @@ import pytest
 from garat_jax.diagnosis import timestep
 from garat_jax.diagnosis.differences import STEP, clear_differences
 from garat_jax.diagnosis.fit import converge, fit
-from garat_jax.diagnosis.held_out import warn_of_timestep
+from garat_jax.diagnosis.held_out import (
+    errors_of,
+    finer_errors,
+    measure_held_out,
+    warn_of_timestep,
+)
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import Floor, make_metric, noise_floor, trusted
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.starts import follow, settle, settle_twice
 from garat_jax.diagnosis.timestep import count_timestep
-from garat_jax.effects import CoggingTorque, ContactFriction, TorqueOffset, ViscousDamping
+from garat_jax.effects import (
+    CoggingTorque,
+    ContactFriction,
+    MotorGain,
+    TorqueOffset,
+    ViscousDamping,
+)
 from tests.diagnosis import pendulum, test_contact
 from tests.diagnosis.test_fit import UNIFORM, make_problem, record
 from tests.diagnosis.test_starts import FRICTION, problem_of
@@ -245,8 +257,8 @@ BALL = """
 """
 
 
-def bounced(seed: int) -> Recording:
-    """Lift a ball and let it bounce, at a 32nd of its model's timestep."""
+def bounced(seed: int, push: float = 0.0) -> Recording:
+    """Lift a ball, pushed to and fro or not, and let it bounce, at a 32nd of its timestep."""
     rng = np.random.default_rng(seed)
     spec = mujoco.MjSpec.from_string(BALL)
     spec.option.timestep /= 32
@@ -255,7 +267,7 @@ def bounced(seed: int) -> Recording:
     ctrl = np.repeat(rng.uniform(-10, 17, 100), 10)
     for command in ctrl:
         states.append([*data.qpos, *data.qvel])
-        data.ctrl[0] = command
+        data.ctrl[0], data.qfrc_applied[0] = command, push * np.sin(8.0 * data.time)
         mujoco.mj_step(model, data, 32)
     states = np.asarray(states) + rng.normal(size=(1000, 2)) * [1e-4, 2e-3]
     return Recording(
@@ -271,15 +283,58 @@ def bounced(seed: int) -> Recording:
     )
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_where_a_ball_bounces_the_noise_floor_is_near_what_the_true_model_leaves(seed):
+def settled_ball(seed: int, push: float = 0.0):
+    """Return a ball's problem, half of it held out, and its model with initial states settled."""
     model = Model("ball", Path(__file__), Path(__file__), mujoco.MjSpec.from_string(BALL))
-    problem = make_problem([bounced(seed)], (), horizon=0.2, model=model, timestep=0.004)
+    problem = make_problem([bounced(seed, push)], (), horizon=0.2, model=model, timestep=0.004)
     problem = dataclasses.replace(problem, fitted=np.arange(len(problem.fitted)) % 2 > 0)
     theta = problem.simulator.base
     problem = trusted(problem, settle(problem, theta, problem.segments.start))
-    settled = settle_twice(problem, settle(problem, theta, problem.segments.start))
+    return problem, settle_twice(problem, settle(problem, theta, problem.segments.start))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_where_a_ball_bounces_the_noise_floor_is_near_what_the_true_model_leaves(seed):
+    problem, settled = settled_ball(seed)
     metric, held_out = make_metric(problem), ~problem.fitted
     left = metric.error(settled.residual, held_out)
     assert left > 4 * metric.of_noise(held_out)
     assert noise_floor(problem, metric, settled).error == pytest.approx(left, rel=0.25)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_impacts_hide_at_the_models_timestep_shows_at_a_finer_one(seed):
+    """The push is not in the model; beside the integrator's error at impacts it makes no error."""
+    for push, is_seen in ((0.0, False), (0.4, True)):
+        problem, settled = settled_ball(seed, push)
+        floor = noise_floor(problem, make_metric(problem), settled)
+        error = errors_of(problem, (settled, settled), floor, "held out")
+        finer = finer_errors(problem, settled, "held out")
+        assert error.is_coarse and error.is_near_floor
+        assert not finer.is_coarse
+        assert finer.is_near_floor is not is_seen
+        assert finer.timestep == 0.004 / 16
+
+
+@pytest.mark.parametrize(("push", "explained"), [(0.0, True), (0.4, False)])
+def test_what_was_found_is_measured_at_a_finer_timestep_too(monkeypatch, push, explained):
+    monkeypatch.setattr("garat_jax.diagnosis.held_out.longest_errors", lambda *_: None)
+    weak = mujoco.MjSpec.from_string(BALL.replace('joint="z"', 'joint="z" gear="0.5"'))
+    model = Model("ball", Path(__file__), Path(__file__), weak)
+    recordings = [bounced(seed, push) for seed in (0, 1)]
+    candidates = [MotorGain("actuator/lift")]
+    problem = make_problem(recordings, candidates, horizon=0.2, model=model, timestep=0.004)
+    problem = dataclasses.replace(problem, fitted=problem.segments.recording < 1)
+    problem = trusted(problem, settle(problem, np.array([2.0]), problem.segments.start))
+    before, after = (settle(problem, np.array([x]), problem.segments.start) for x in (1.0, 2.0))
+    floor = noise_floor(problem, make_metric(problem), after)
+    grid = choose_grid(recordings, 0.004)
+
+    def measured(fits):
+        return measure_held_out(problem, fits, floor, recordings, grid, "held out")
+
+    found = measured((before, after))
+    assert found.error.is_explained
+    assert found.finer and found.finer.is_explained is explained
+    assert found.are_explained is explained
+    assert measured((before, before)).finer is None
