@@ -1,7 +1,8 @@
 """The minimum of a cost that contacts make rough, and how sure it is.
 
 Where the cost jumps from one set of parameters to the next, a fit ends in the deepest dip that it
-met. A quadratic through the costs around it (Box and Wilson 1951) is what all of them say.
+met. A quadratic through the costs around it (Box and Wilson 1951) is what all of them say, and the
+next one, around its minimum, if that is not near.
 """
 
 import numpy as np
@@ -14,12 +15,22 @@ OFFSETS = (-2.0, -1.5, -1.0, 1.0, 1.5, 2.0)
 """Where the cost is measured, in half-widths of a 95 % interval; not in the dip itself."""
 WIDENED = 2
 """How often they are doubled along an axis on which the cost shows no curvature."""
+MOVES = 5
+"""Largest number of surfaces, each around the minimum of the one before."""
+NEAR = 1.0
+"""Farthest minimum, in half-widths along an axis, that a surface tells; beyond, it says where to
+look."""
 CURVED = 3.0
 """Standard errors by which a curvature shows."""
 
 
 def smooth_minimum(
-    problem: Problem, fitted: Fit, columns: np.ndarray, covariance: np.ndarray, sure: float
+    problem: Problem,
+    fitted: Fit,
+    columns: np.ndarray,
+    covariance: np.ndarray,
+    sure: float,
+    moves: int = MOVES,
 ) -> tuple[Fit, np.ndarray]:
     """Move a fit to the minimum of a smooth surface through the costs around it.
 
@@ -29,42 +40,74 @@ def smooth_minimum(
         columns: Indices of the parameters that are excited, k of them.
         covariance: Theirs, as noise alone makes it, [k, k].
         sure: Half-width of a 95 % interval in standard deviations.
+        moves: Largest number of surfaces.
 
     Returns:
         The fit there, initial states settled, and how far its parameters may be from there for the
         roughness, half the width of 95 % intervals, [k].
     """
     some = np.flatnonzero(problem.fitted)
-    problem_here, here = problem.take(some), fitted.take(some)
     half = sure * np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(half, half) * sure**2
     share, ways = np.linalg.eigh(correlation)
     axes = half[:, None] * ways * np.sqrt(np.maximum(share, 1e-6))
+    move, unsure = _move(problem.take(some), fitted.take(some), columns, axes)
+    theta = fitted.theta.copy()
+    theta[columns] = problem.within_bounds(columns, theta[columns] + move)
+    moved, by = follow(problem, theta, fitted), (theta - fitted.theta)[columns]
+    if moves > 1 and np.any(np.abs(np.linalg.solve(axes, by)) > NEAR):
+        return smooth_minimum(problem, moved, columns, covariance, sure, moves - 1)
+    return moved, unsure
+
+
+def _move(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
+    """Return how far a surface's minimum is from a fit, and how far it may be from there, [k] each.
+
+    Axes [k, k] along which no curvature shows are doubled.
+    """
     num_axes, widened = len(columns), 0
     places = np.empty((len(OFFSETS) * num_axes, num_axes))
-    costs, flat = np.empty(len(places)), np.ones(num_axes, bool)
+    costs, flat = np.empty((len(places), len(fitted.start))), np.ones(num_axes, bool)
     while True:
         rows = np.repeat(flat, len(OFFSETS))
-        places[rows], costs[rows] = _around(problem_here, here, columns, axes[:, flat])
-        move, unsure, is_curved = _minimum(np.linalg.solve(axes, places.T).T, costs)
+        places[rows], costs[rows] = _around(problem, fitted, columns, axes[:, flat])
+        at = np.linalg.solve(axes, places.T).T
+        move, unsure, is_curved = _minimum(at, _together(costs, problem.expected))
         if widened == WIDENED or np.all(is_curved):
             break
         widened, flat = widened + 1, ~is_curved
         axes = np.where(flat, 2.0, 1.0) * axes
-    theta = fitted.theta.copy()
-    theta[columns] = problem.within_bounds(columns, theta[columns] + axes @ move)
-    return follow(problem, theta, fitted), np.sqrt(np.sum((axes * unsure) ** 2, axis=1))
+    return axes @ move, np.sqrt(np.sum((axes * unsure) ** 2, axis=1))
 
 
 def _around(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
-    """Return places along some axes [k, m], as changes of the parameters [n, k], and costs [n]."""
+    """Return places along some axes [k, m], as changes of the parameters [n, k], and costs [n, S].
+
+    These are of each segment.
+    """
     steps = np.concatenate([np.outer(OFFSETS, axis) for axis in axes.T])
     here = fitted.theta[columns]
     values = problem.within_bounds(columns, here + steps)
     thetas = np.tile(fitted.theta, (len(values), 1))
     thetas[:, columns] = values
-    costs = [fit.cost.sum() for fit in follow_each(problem, thetas, fitted)]
-    return values - here, np.asarray(costs)
+    return values - here, np.stack([fit.cost for fit in follow_each(problem, thetas, fitted)])
+
+
+def _together(costs: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Add up the costs of segments at some places, [n, S], so that none outvotes the others, [n].
+
+    One whose initial state was not found, on the wrong side of a contact, leaves many times what
+    the others do, and another amount at each place. Beyond what is usual a cost therefore counts by
+    its logarithm (Lorentzian; Cauchy's distribution).
+
+    Args:
+        costs: Of each segment at each place.
+        expected: What noise makes of them, [S].
+    """
+    told = expected > 0
+    share = costs[:, told] / expected[told]
+    usual = max(1.0, float(np.median(share)))
+    return np.sum(expected[told] * usual * np.log1p(share / usual), axis=1)
 
 
 def _minimum(at: np.ndarray, costs: np.ndarray):

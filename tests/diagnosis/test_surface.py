@@ -56,6 +56,25 @@ def test_from_anywhere_near_a_smooth_minimum_is_found_and_is_sure(smooth):
     assert rough[0] < 0.2 * half
 
 
+def test_a_minimum_far_from_where_a_fit_stopped_is_gone_to(smooth):
+    problem, found, covariance, sure = smooth
+    half = sure * np.sqrt(covariance[0, 0])
+    off = follow(problem, found.theta + 6.0 * half, found)
+    back, _ = smooth_minimum(problem, off, COLUMNS, covariance, sure)
+    assert back.theta[0] == pytest.approx(found.theta[0], abs=0.1 * half)
+
+
+def test_a_segment_whose_initial_state_was_not_found_does_not_outvote_the_others():
+    expected = np.full(30, 100.0)
+    costs = np.stack([expected, 1.02 * expected])
+    costs[:, 0] = 3000.0, 2500.0
+    assert costs[1].sum() < costs[0].sum()
+    right, wrong = surface._together(costs, expected)
+    assert right < wrong
+    right, wrong = surface._together(costs[:, 1:], expected[1:])
+    assert wrong - right == pytest.approx(0.5 * 29 * 2.0, rel=0.05)
+
+
 def test_the_deepest_dip_of_a_rough_cost_is_left_for_the_middle_of_all(smooth):
     problem, found, covariance, sure = smooth
     half = sure * np.sqrt(covariance[0, 0])
