@@ -131,7 +131,8 @@ def diagnose_keeping(
         still=is_still(problem.segments),
         left=(),
     )
-    left = leftover(problem, outcome.after, everything, host) if found.is_left else ()
+    is_seen = found.is_left and found.decisive is not found.finer
+    left = leftover(problem, outcome.after, everything, host) if is_seen else ()
     found = dataclasses.replace(found, left=tuple(left), seconds=time.monotonic() - started)
     return found, simulator
 

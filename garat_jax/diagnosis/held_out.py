@@ -23,7 +23,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle
-from garat_jax.diagnosis.timestep import REFINEMENTS, refined
+from garat_jax.diagnosis.timestep import REFINEMENTS, at_finer_timestep
 
 COARSE = 3.0
 """The timestep's error, in standard deviations of a signal's noise, that a warning is given of."""
@@ -73,7 +73,7 @@ def measure_held_out(
     error = errors_of(problem, fits, floor, how)
     found = HeldOut(error, longest_errors(problem, after.theta, recordings, grid, how))
     is_found = np.any(after.theta != problem.simulator.base)
-    if not (is_found and error.is_coarse and found.are_explained):
+    if not (is_found and error.integrator_exceeds_noise and found.are_explained):
         return found
     return found._replace(finer=finer_errors(problem, after, how))
 
@@ -153,29 +153,34 @@ def longest_errors(
     return None if errors.is_too_coarse else errors
 
 
-def finer_errors(problem: Problem, after: Fit, how: str, refinements: int = REFINEMENTS) -> Errors:
+def finer_errors(
+    problem: Problem, after: Fit, how: str, refinements: int = REFINEMENTS
+) -> Errors | None:
     """Return the errors at a finer timestep, down to one whose own error noise hides.
 
     What stays unexplained may show there alone: at the model's timestep the integrator's error,
     after impacts most of all, may hide much more than noise does. Physics that is right at any
-    timestep comes down to the noise.
+    timestep comes down to the noise. Segments whose initial state is not found do not count.
 
     Args:
         problem: The recordings, cut as they were fitted.
-        after: The fit of what was found, as a timestep of 0 has it.
+        after: The fit of what was found, as near to a timestep of 0 as it could be taken.
         how: Names the recordings that are held out.
         refinements: How often the timestep is refined at most.
+
+    Returns:
+        None where the integrator's error would hide any other there, too.
     """
     held_out = np.flatnonzero(~problem.fitted)
-    finer, near = refined(problem.take(held_out), after.take(held_out))
-    finer = trusted(finer, near)
+    finer, near = at_finer_timestep(problem.take(held_out), after.take(held_out))
     near = settle(finer, near.theta, near.start)
     before = settle(finer, finer.simulator.base, finer.segments.start)
     floor = noise_floor(finer, make_metric(finer), near)
-    errors = errors_of(finer, (before, near), floor, how, signals_mostly_above)
-    if errors.is_coarse and refinements > 1:
-        return finer_errors(finer, near, how, refinements - 1)
-    return errors
+    errors = errors_of(finer, (before, near), floor, how)
+    found = None if errors.is_too_coarse else errors
+    if errors.integrator_exceeds_noise and refinements > 1:
+        return finer_errors(finer, near, how, refinements - 1) or found
+    return found
 
 
 def warn_of_timestep(problem: Problem, floor: Floor, host: mujoco.MjModel) -> tuple[str, ...]:

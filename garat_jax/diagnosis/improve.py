@@ -53,7 +53,8 @@ class Improvement:
     Attributes:
         diagnosis: All rounds as one: the first one's view of the model, everything that was added,
             the ladder over all of it at one horizon, and the last one's verdict on what is left,
-            its warnings, and what the recordings do not show of the repaired model.
+            unless a finer timestep shows more, its warnings, and what the recordings do not show
+            of the repaired model.
         rounds: Each diagnosis, the first of the model as it was.
         model: The repaired model.
     """
@@ -269,14 +270,15 @@ def run_improve(
 
 def _rounds_section(rounds: Sequence[Diagnosis]) -> Section:
     """Show what each diagnosis found in the model as the one before had left it."""
-    columns = ["diagnosis", "verdict", "adds", "over [s]", "before", "after", "noise floor"]
-    columns.append("unexplained [%]")
+    columns = ["diagnosis", "verdict", "adds", "over [s]", "timestep [s]", "before", "after"]
+    columns += ["noise floor", "unexplained [%]"]
     rows = [
         (
             number,
             found.verdict.replace("_", " "),
             ", ".join(str(c.named) for c in found.selected) or "nothing",
             error.horizon,
+            error.timestep,
             error.before,
             error.after,
             error.noise_floor,
@@ -294,8 +296,10 @@ def _rounds_section(rounds: Sequence[Diagnosis]) -> Section:
 
 def _card_section(done: Improvement) -> Section:
     last = done.rounds[-1]
+    hidden = done.diagnosis.verdict == "unexplained"
     what_is_left = {
-        "adequate": "A last diagnosis of the repaired model found it adequate.",
+        "adequate": "A last diagnosis of the repaired model found it adequate"
+        f"{' at its own timestep; at a finer one a gap stays' if hidden else ''}.",
         "unexplained": "A last diagnosis of the repaired model found a gap that no further effect "
         "of the catalogue explains.",
         "missing_effect": "The last diagnosis still found something; it was added, and the "

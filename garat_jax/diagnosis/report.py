@@ -149,7 +149,7 @@ def diagnosis_sections(
     everything = (*fitted, *held_out)
     view = look(model, everything, range(len(fitted), len(everything)), diagnosis.selected)
     return [
-        _errors(diagnosis.decisive, view),
+        _errors(diagnosis.shown, view),
         traces(view),
         *([] if diagnosis.verdict == "adequate" else _where(diagnosis.where, view)),
         *ranking_section(diagnosis),

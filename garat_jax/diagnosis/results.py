@@ -110,7 +110,7 @@ class Errors:
         return self.integrator > TOO_COARSE
 
     @property
-    def is_coarse(self) -> bool:
+    def integrator_exceeds_noise(self) -> bool:
         """Whether the integrator's error is above noise's, so that it hides what noise does not."""
         return self.integrator > self.noise_floor / math.sqrt(2.0)
 
@@ -310,6 +310,11 @@ class Diagnosis:
             return self.error
         return next((e for e in measured if not self._is_right(e)), self.error)
 
+    @property
+    def shown(self) -> Errors:
+        """The errors beside what is simulated at the model's own timestep."""
+        return self.error if self.decisive is self.finer else self.decisive
+
     def _is_right(self, error: Errors) -> bool:
         """Whether errors alone would say that nothing, or nothing more, is missing."""
         return error.is_explained if self.selected else error.is_adequate
@@ -329,6 +334,9 @@ class Diagnosis:
     @property
     def left_lines(self) -> list[str]:
         """What the gap that stays goes with, in words; nothing if none stays."""
+        if self.is_left and self.finer is not None and self.decisive is self.finer:
+            timestep = f"{self.finer.timestep:.2g} s"
+            return [f"it shows at a timestep of {timestep}: a model that has it may tell more"]
         lines = [place.evidence for place in self.left[:3]]
         nothing = ["the torque that is still missing follows no simple pattern"]
         return (lines or nothing) if self.is_left else []

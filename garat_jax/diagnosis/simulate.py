@@ -32,7 +32,7 @@ from garat_jax.errors import UserError
 
 NUM_PROGRAMS, NUM_FINER = 40, 4
 """How many programs stay compiled: on a CPU one takes some 250 of a process's 65,530 memory maps,
-and a diagnosis has two simulators, of up to two batch sizes a program, and five finer ones."""
+and a diagnosis has two simulators, of up to two batch sizes a program, and seven finer ones."""
 FEW = 4
 """Candidates up to which a program with calls a substep is optimised. In those that fit them, which
 run often, few act; in those of screening, which run a few times, as many as a model has places for

@@ -55,9 +55,11 @@ def smooth_minimum(
     theta = fitted.theta.copy()
     theta[columns] = problem.within_bounds(columns, theta[columns] + move)
     moved, by = follow(problem, theta, fitted), (theta - fitted.theta)[columns]
-    if moves > 1 and np.any(np.abs(np.linalg.solve(axes, by)) > NEAR):
+    if np.all(np.abs(np.linalg.solve(axes, by)) <= NEAR):
+        return moved, unsure
+    if moves > 1:
         return smooth_minimum(problem, moved, columns, covariance, sure, moves - 1)
-    return moved, unsure
+    return moved, np.hypot(unsure, by)
 
 
 def _move(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):

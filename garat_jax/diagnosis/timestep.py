@@ -185,7 +185,7 @@ def _at_finer_timesteps(
     half = half_before = (fitted.high - fitted.low)[excited] / 2
     for number in range(REFINEMENTS):
         half_before = half
-        some, before = _finer(some, near)
+        some, before = at_finer_timestep(some, near)
         near = fit(
             some,
             before.theta,
@@ -234,23 +234,18 @@ def _chosen(problem: Problem, num: int) -> np.ndarray:
     return fitted[is_chosen]
 
 
-def refined(problem: Problem, near: Fit) -> tuple[Problem, Fit]:
-    """Return a problem at a finer timestep, every sample trusted, and a fit settled there."""
-    everything = np.ones_like(problem.segments.trust)
-    segments = dataclasses.replace(problem.segments, trust=everything)
-    simulator = problem.simulator.refined(REFINED)
-    finer = dataclasses.replace(problem, simulator=simulator, segments=segments)
-    return finer, settle_twice(finer, follow(finer, near.theta, near))
-
-
-def _finer(problem: Problem, near: Fit) -> tuple[Problem, Fit]:
+def at_finer_timestep(problem: Problem, near: Fit) -> tuple[Problem, Fit]:
     """Return a problem at a finer timestep and a fit's initial states settled there.
 
     What a sample is trusted follows from the error at this timestep. Segments that stay far from
     what was measured, when most do not, are left out: their initial states were not found, on the
     wrong side of a contact.
     """
-    finer, settled = refined(problem, near)
+    everything = np.ones_like(problem.segments.trust)
+    segments = dataclasses.replace(problem.segments, trust=everything)
+    simulator = problem.simulator.refined(REFINED)
+    finer = dataclasses.replace(problem, simulator=simulator, segments=segments)
+    settled = settle_twice(finer, follow(finer, near.theta, near))
     share = settled.cost / finer.expected
     found = np.flatnonzero(share <= LOST * max(1.0, float(np.median(share))))
     finer, settled = finer.take(found), settled.take(found)

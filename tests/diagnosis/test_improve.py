@@ -12,7 +12,7 @@ from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.findings import Drift, Estimate
 from garat_jax.diagnosis.held_out import HeldOut
 from garat_jax.diagnosis.hidden import make_recordings
-from garat_jax.diagnosis.improve import _as_one, run_improve
+from garat_jax.diagnosis.improve import _as_one, _card_section, run_improve
 from garat_jax.effects import CATALOGUE
 from garat_jax.runs import RunDirectory
 from tests import models
@@ -83,6 +83,23 @@ def test_warnings_are_those_of_the_repaired_model(improved, monkeypatch):
     assert "\n  warning: of 1" in str(warned)
     assert "of 0" not in str(warned)
     assert warned.to_json()["warnings"] == ["of 1"]
+
+
+def test_a_gap_that_a_finer_timestep_shows_is_left_by_a_model_that_is_adequate(
+    improved, monkeypatch
+):
+    done = improved[2]
+    first, last = done.rounds
+    gap = dataclasses.replace(last.error, after=1.0, unexplained_share=0.9, timestep=0.0005)
+    measured = ((), HeldOut(done.diagnosis.error, None, gap), ())
+    monkeypatch.setattr("garat_jax.diagnosis.improve._ladder", lambda *given: measured)
+    whole = _as_one(done.model, (), (), [first, last], first.selected)
+    assert (last.verdict, whole.verdict) == ("adequate", "unexplained")
+    assert whole.decisive is gap and whole.shown is whole.error
+    (line,) = whole.left_lines
+    assert line.startswith("it shows at a timestep of 0.0005 s")
+    section = _card_section(dataclasses.replace(done, diagnosis=whole))
+    assert "adequate at its own timestep; at a finer one a gap stays." in section.text
 
 
 def test_a_drift_that_the_later_rounds_explain_is_not_said(improved, monkeypatch):

@@ -75,6 +75,42 @@ def test_a_segment_whose_initial_state_was_not_found_does_not_outvote_the_others
     assert wrong - right == pytest.approx(0.5 * 29 * 2.0, rel=0.05)
 
 
+class Lost:
+    """A simulator of which one segment is far off, a little less so the larger the parameter."""
+
+    def __init__(self, smooth: Simulator, first: int, size: np.ndarray, half: float):
+        self.smooth, self.first, self.size, self.half = smooth, first, size, half
+        self.effects, self.slots, self.base = smooth.effects, smooth.slots, smooth.base
+        self.host = smooth.host
+
+    def predict(self, theta, start, segments) -> np.ndarray:
+        predicted = self.smooth.predict(theta, start, segments)
+        lost = (segments.recording == 0) & (segments.first == self.first)
+        less = 1.0 - 0.005 * (theta[..., 0] - TRUTH) / self.half
+        wave = (-1.0) ** np.arange(predicted.shape[2])[:, None] * self.size
+        off = less.reshape(len(predicted), -1, 1, 1) * wave
+        return predicted + np.where(lost[:, None, None], off, 0.0)
+
+
+def test_the_minimum_of_all_is_found_beside_a_segment_that_is_lost(smooth):
+    problem, found, covariance, sure = smooth
+    half, noise = sure * np.sqrt(covariance[0, 0]), 15.0 * problem.segments.noise
+    simulator = Lost(problem.simulator, problem.segments.first[0], noise, half)
+    lost = dataclasses.replace(problem, simulator=simulator)
+    off = follow(lost, found.theta + 0.5 * half, found)
+    back, _ = smooth_minimum(lost, off, COLUMNS, covariance, sure)
+    assert back.theta[0] == pytest.approx(found.theta[0], abs=0.5 * half)
+
+
+def test_what_the_last_surface_moved_counts_as_unsure(smooth):
+    problem, found, covariance, sure = smooth
+    half = sure * np.sqrt(covariance[0, 0])
+    off = follow(problem, found.theta + 6.0 * half, found)
+    back, unsure = smooth_minimum(problem, off, COLUMNS, covariance, sure, moves=1)
+    assert abs(back.theta[0] - found.theta[0]) > half
+    assert unsure[0] > 0.9 * (off.theta[0] - back.theta[0]) > half
+
+
 def test_the_deepest_dip_of_a_rough_cost_is_left_for_the_middle_of_all(smooth):
     problem, found, covariance, sure = smooth
     half = sure * np.sqrt(covariance[0, 0])

@@ -283,10 +283,12 @@ def bounced(seed: int, push: float = 0.0) -> Recording:
     )
 
 
-def settled_ball(seed: int, push: float = 0.0):
+def settled_ball(seed: int, push: float = 0.0, candidates=()):
     """Return a ball's problem, half of it held out, and its model with initial states settled."""
     model = Model("ball", Path(__file__), Path(__file__), mujoco.MjSpec.from_string(BALL))
-    problem = make_problem([bounced(seed, push)], (), horizon=0.2, model=model, timestep=0.004)
+    problem = make_problem(
+        [bounced(seed, push)], candidates, horizon=0.2, model=model, timestep=0.004
+    )
     problem = dataclasses.replace(problem, fitted=np.arange(len(problem.fitted)) % 2 > 0)
     theta = problem.simulator.base
     problem = trusted(problem, settle(problem, theta, problem.segments.start))
@@ -310,8 +312,8 @@ def test_what_impacts_hide_at_the_models_timestep_shows_at_a_finer_one(seed):
         floor = noise_floor(problem, make_metric(problem), settled)
         error = errors_of(problem, (settled, settled), floor, "held out")
         finer = finer_errors(problem, settled, "held out")
-        assert error.is_coarse and error.is_near_floor
-        assert not finer.is_coarse
+        assert error.integrator_exceeds_noise and error.is_near_floor
+        assert finer and not finer.integrator_exceeds_noise
         assert finer.is_near_floor is not is_seen
         assert finer.timestep == 0.004 / 16
 
@@ -338,3 +340,29 @@ def test_what_was_found_is_measured_at_a_finer_timestep_too(monkeypatch, push, e
     assert found.finer and found.finer.is_explained is explained
     assert found.are_explained is explained
     assert measured((before, before)).finer is None
+
+
+def test_a_finer_timestep_tells_nothing_of_a_model_as_it_is_or_where_noise_hides_more(monkeypatch):
+    monkeypatch.setattr("garat_jax.diagnosis.held_out.longest_errors", lambda *_: None)
+    monkeypatch.setattr("garat_jax.diagnosis.held_out.finer_errors", lambda *_: "measured")
+    problem, settled = settled_ball(0, candidates=[MotorGain("actuator/lift")])
+    floor = noise_floor(problem, make_metric(problem), settled)
+
+    def measured(fit, floor):
+        fits = settled, fit
+        return measure_held_out(problem, fits, floor, [], choose_grid([bounced(0)], 0.004), "")
+
+    found = dataclasses.replace(settled, theta=np.array([1.001]))
+    as_it_is = measured(settled, floor)
+    assert as_it_is.are_explained and as_it_is.error.integrator_exceeds_noise
+    assert as_it_is.finer is None
+    assert measured(found, floor).finer == "measured"
+    noise = make_metric(problem).of_noise(~problem.fitted)
+    loud = dataclasses.replace(found, residual=0.0 * found.residual)
+    assert measured(loud, floor._replace(error=1.2 * noise)).finer is None
+
+
+def test_an_engine_that_errs_as_much_at_a_finer_timestep_tells_nothing_there(monkeypatch):
+    problem, settled = settled_ball(0)
+    monkeypatch.setattr("garat_jax.diagnosis.results.TOO_COARSE", 1e-6)
+    assert finer_errors(problem, settled, "held out") is None
