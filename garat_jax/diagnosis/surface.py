@@ -15,11 +15,11 @@ OFFSETS = (-2.0, -1.5, -1.0, 1.0, 1.5, 2.0)
 """Where the cost is measured, in half-widths of a 95 % interval; not in the dip itself."""
 WIDENED = 2
 """How often they are doubled along an axis on which the cost shows no curvature."""
-MOVES = 5
+MOVES = 4
 """Largest number of surfaces, each around the minimum of the one before."""
 NEAR = 1.0
-"""Farthest minimum, in half-widths along an axis, that a surface tells; beyond, it says where to
-look."""
+"""Farthest minimum, in half-widths along an axis, that a surface tells; beyond, if that is sure, it
+says where to look."""
 CURVED = 3.0
 """Standard errors by which a curvature shows."""
 
@@ -55,11 +55,10 @@ def smooth_minimum(
     theta = fitted.theta.copy()
     theta[columns] = problem.within_bounds(columns, theta[columns] + move)
     moved, by = follow(problem, theta, fitted), (theta - fitted.theta)[columns]
-    if np.all(np.abs(np.linalg.solve(axes, by)) <= NEAR):
-        return moved, unsure
-    if moves > 1:
+    is_far = np.any(np.abs(np.linalg.solve(axes, by)) > NEAR) and np.any(np.abs(by) > unsure)
+    if is_far and moves > 1:
         return smooth_minimum(problem, moved, columns, covariance, sure, moves - 1)
-    return moved, np.hypot(unsure, by)
+    return moved, np.hypot(unsure, by) if is_far else unsure
 
 
 def _move(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
