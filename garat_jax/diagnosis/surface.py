@@ -18,8 +18,8 @@ WIDENED = 2
 MOVES = 4
 """Largest number of surfaces, each around the minimum of the one before."""
 NEAR = 1.0
-"""Farthest minimum, in half-widths along an axis, that a surface tells; beyond, if that is sure, it
-says where to look."""
+"""Farthest minimum, relative to its axis, that a surface tells; beyond, if that is sure, it says
+where to look."""
 CURVED = 3.0
 """Standard errors by which a curvature shows."""
 
@@ -51,20 +51,24 @@ def smooth_minimum(
     correlation = covariance / np.outer(half, half) * sure**2
     share, ways = np.linalg.eigh(correlation)
     axes = half[:, None] * ways * np.sqrt(np.maximum(share, 1e-6))
-    move, unsure = _move(problem.take(some), fitted.take(some), columns, axes)
-    theta = fitted.theta.copy()
-    theta[columns] = problem.within_bounds(columns, theta[columns] + move)
-    moved, by = follow(problem, theta, fitted), (theta - fitted.theta)[columns]
-    is_far = np.any(np.abs(np.linalg.solve(axes, by)) > NEAR) and np.any(np.abs(by) > unsure)
-    if is_far and moves > 1:
-        return smooth_minimum(problem, moved, columns, covariance, sure, moves - 1)
-    return moved, np.hypot(unsure, by) if is_far else unsure
+    while True:
+        axes, move, unsure = _move(problem.take(some), fitted.take(some), columns, axes)
+        theta = fitted.theta.copy()
+        theta[columns] = problem.within_bounds(columns, theta[columns] + axes @ move)
+        fitted, by = follow(problem, theta, fitted), (theta - fitted.theta)[columns]
+        along, moves = np.abs(np.linalg.solve(axes, by)), moves - 1
+        is_far = np.any((along > NEAR) & (along > unsure))
+        if not is_far or not moves:
+            rough = np.sqrt(np.sum((axes * unsure) ** 2, axis=1))
+            return fitted, np.hypot(rough, by) if is_far else rough
 
 
 def _move(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
-    """Return how far a surface's minimum is from a fit, and how far it may be from there, [k] each.
+    """Return how far a surface's minimum is from a fit, and how far it may be from there.
 
-    Axes [k, k] along which no curvature shows are doubled.
+    Returns:
+        The axes [k, k], doubled where no curvature shows along them, and both relative to them,
+        [k] each.
     """
     num_axes, widened = len(columns), 0
     places = np.empty((len(OFFSETS) * num_axes, num_axes))
@@ -75,10 +79,9 @@ def _move(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
         at = np.linalg.solve(axes, places.T).T
         move, unsure, is_curved = _minimum(at, _together(costs, problem.expected))
         if widened == WIDENED or np.all(is_curved):
-            break
+            return axes, move, unsure
         widened, flat = widened + 1, ~is_curved
         axes = np.where(flat, 2.0, 1.0) * axes
-    return axes @ move, np.sqrt(np.sum((axes * unsure) ** 2, axis=1))
 
 
 def _around(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):

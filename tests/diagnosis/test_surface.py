@@ -47,21 +47,14 @@ def smooth() -> tuple[Problem, Fit, np.ndarray, float]:
     return problem, found, *uncertainty(problem, lin, np.asarray([True]))
 
 
-def test_from_anywhere_near_a_smooth_minimum_is_found_and_is_sure(smooth):
+@pytest.mark.parametrize("off", [0.8, 6.0])
+def test_from_near_and_from_far_a_smooth_minimum_is_found_and_is_sure(smooth, off):
     problem, found, covariance, sure = smooth
     half = sure * np.sqrt(covariance[0, 0])
-    off = follow(problem, found.theta + 0.8 * half, found)
+    off = follow(problem, found.theta + off * half, found)
     back, rough = smooth_minimum(problem, off, COLUMNS, covariance, sure)
     assert back.theta[0] == pytest.approx(found.theta[0], abs=0.1 * half)
     assert rough[0] < 0.2 * half
-
-
-def test_a_minimum_far_from_where_a_fit_stopped_is_gone_to(smooth):
-    problem, found, covariance, sure = smooth
-    half = sure * np.sqrt(covariance[0, 0])
-    off = follow(problem, found.theta + 6.0 * half, found)
-    back, _ = smooth_minimum(problem, off, COLUMNS, covariance, sure)
-    assert back.theta[0] == pytest.approx(found.theta[0], abs=0.1 * half)
 
 
 def test_a_segment_whose_initial_state_was_not_found_does_not_outvote_the_others():
@@ -130,14 +123,18 @@ def test_the_deepest_dip_of_a_rough_cost_is_left_for_the_middle_of_all(smooth):
     assert np.mean(inside) > 0.75
 
 
-def test_places_keep_up_with_axes_that_are_widened_later(monkeypatch):
+@pytest.fixture(scope="module")
+def pair() -> tuple[Problem, Fit, np.ndarray, np.ndarray, float]:
     recordings = [record(np.arange(400) * 0.004, seed=seed) for seed in range(2)]
     laws = [ViscousDamping("joint/hinge"), TorqueOffset("joint/hinge")]
     problem = make_problem(recordings, laws)
     both, base = np.asarray([0, 1]), problem.simulator.base
     found = follow(problem, base, fit(problem, base, problem.segments.start, both))
     lin = linearise(problem, base, found.start, both, [1e-4, 1e-3], found.sensitivity)
-    covariance, sure = uncertainty(problem, lin, np.asarray([True, True]))
+    return problem, found, both, *uncertainty(problem, lin, np.asarray([True, True]))
+
+
+def test_places_keep_up_with_axes_that_are_widened_later(pair, monkeypatch):
     seen, minimum = [], surface._minimum
 
     def second_is_flat(at, costs):
@@ -145,10 +142,26 @@ def test_places_keep_up_with_axes_that_are_widened_later(monkeypatch):
         return *minimum(at, costs)[:2], np.asarray([True, False])
 
     monkeypatch.setattr(surface, "_minimum", second_is_flat)
-    smooth_minimum(problem, found, both, covariance, sure)
+    smooth_minimum(*pair)
     kept = len(surface.OFFSETS)
     assert np.any(seen[0][:kept, 1] != 0)  # the bound of damping, 0, bends the first axis
     np.testing.assert_allclose(seen[1][:kept], seen[0][:kept] * [1.0, 0.5], atol=1e-9)
+
+
+@pytest.mark.parametrize(("second", "surfaces"), [(1.5, 1), (1.0, surface.MOVES)])
+def test_a_minimum_that_is_far_along_an_axis_has_to_be_sure_along_it(
+    pair, monkeypatch, second, surfaces
+):
+    seen = []
+
+    def minimum(at, costs):
+        seen.append(at)
+        return np.asarray([0.5, 1.3]), np.asarray([0.1, second]), np.asarray([True, True])
+
+    monkeypatch.setattr(surface, "_minimum", minimum)
+    monkeypatch.setattr(Problem, "within_bounds", lambda problem, columns, values: values)
+    smooth_minimum(*pair)
+    assert len(seen) == surfaces
 
 
 def test_a_minimum_beyond_a_bound_is_not_gone_to():
