@@ -121,14 +121,19 @@ def _rows(
                         counted[text].append((time, _number(error.counted, source)))
     for text, source in wanted.items():
         found[text] = found[text] or counted[text]
-        if text in others and not found[text] and str(source.element).isdigit():
-            what = f"no message of {source.topic} has an element [{source.element}]"
-            raise UserError(f"{what} of {source.field}, by name or by number")
-        if text in others and not found[text] and not others[text]:
-            raise UserError(f"{source.topic} names no elements, so it has no [{source.element}]")
         if text in others and not found[text]:
-            raise unknown_name(f"name in {source.topic}", str(source.element), sorted(others[text]))
+            raise _no_such_element(source, others[text])
     return found
+
+
+def _no_such_element(source: Source, names: set[str]) -> UserError:
+    """Return the error of an element that no message has, by the names that theirs have."""
+    if str(source.element).isdigit():
+        what = f"no message of {source.topic} has an element [{source.element}]"
+        return UserError(f"{what} of {source.field}, by name or by number")
+    if not names:
+        return UserError(f"{source.topic} names no elements, so it has no [{source.element}]")
+    return unknown_name(f"name in {source.topic}", str(source.element), sorted(names))
 
 
 class _NotInMessageError(Exception):
