@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from garat_jax.diagnosis.drift import find_drifts
+from garat_jax.diagnosis.findings import Drift
 from garat_jax.diagnosis.held_out import (
     HeldOut,
     measure_held_out,
@@ -34,6 +35,7 @@ from garat_jax.diagnosis.segments import SHORTEST, grid_for
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.steps import fit_equals
 from garat_jax.diagnosis.suggest import suggest
 from garat_jax.diagnosis.unseen import is_still, unseen
 from garat_jax.dynamics import native_model
@@ -110,21 +112,20 @@ def diagnose_keeping(
         warnings += warn_of_timestep(problem, outcome.floor, host)
     first = [c for c in outcome.candidates[:1] if c.why != NIL]
     explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
+    verdict = verdict_of(outcome.adequate, outcome.selected, measured)
     found = Diagnosis(
         model=str(model.path),
         data=tuple(r.name for r in fitted),
         holdout=tuple(r.name for r in held_out),
         versions=versions(),
         seconds=0.0,
-        verdict=verdict_of(outcome.adequate, outcome.selected, measured),
+        verdict=verdict,
         **measured._asdict(),
         where=tuple(localise(missing_torque(host, everything, world))),
         candidates=outcome.candidates,
         selected=outcome.selected,
         ladder=_ladder(problem, outcome),
-        drifts=find_drifts(problem, outcome.best, everything)
-        if outcome.best and not too_few
-        else (),
+        drifts=() if too_few else _drifts(problem, outcome, everything, verdict, say),
         next_experiment=next_experiment((*outcome.selected, *first), host),
         warnings=warnings,
         unseen=unseen(problem, outcome.before, explaining),
@@ -235,6 +236,22 @@ def verdict_of(adequate: bool, selected: Sequence[Candidate], measured: HeldOut)
         longest = measured.longest
         return "adequate" if longest is None or longest.is_adequate else "unexplained"
     return "missing_effect" if selected and measured.are_explained else "unexplained"
+
+
+def _drifts(
+    problem: Problem,
+    outcome: Outcome,
+    everything: Sequence[Recording],
+    verdict: Verdict,
+    say: Callable[[str], None],
+) -> tuple[Drift, ...]:
+    """Return what drifts of what was found; where a gap stays, or of what is not told from it."""
+    if outcome.best is None:
+        return ()
+    fits = [outcome.best]
+    if verdict == "unexplained":
+        fits += fit_equals(problem, outcome.steps, outcome.after, say)
+    return find_drifts(problem, fits, everything)
 
 
 def _ladder(problem: Problem, outcome: Outcome) -> tuple[Rung, ...]:

@@ -21,7 +21,8 @@ from garat_jax.effects import unit_at
 SIGNIFICANCE = 0.01
 """Largest p-value, corrected for the number of parameters (Bonferroni)."""
 SMALLEST_SHARE = 0.1
-"""Share of what the fit leaves unexplained that a drift must explain."""
+"""Share of what the fit leaves unexplained that a drift must explain, and of what another fit's
+drift leaves by which one of its own has to leave less."""
 
 
 def time_in_recording(problem: Problem, recordings: Sequence[Recording]) -> np.ndarray:
@@ -36,18 +37,33 @@ def time_in_recording(problem: Problem, recordings: Sequence[Recording]) -> np.n
 
 
 def find_drifts(
-    problem: Problem, fitted: Fit, recordings: Sequence[Recording]
+    problem: Problem, fits: Sequence[Fit], recordings: Sequence[Recording]
 ) -> tuple[Drift, ...]:
     """Return the fitted parameters that drift within the recordings, clearest first.
 
+    Where the recordings do not tell fits apart whose parameters are constant, a drift may: those of
+    the first fit count unless one of another leaves much less.
+
     Args:
         problem: What was fitted.
-        fitted: The fit whose parameters are tested.
+        fits: The fits whose parameters are tested, the likely one first.
         recordings: What the segments were cut from, in the order of their indices.
     """
+    found, least = [], np.inf
+    for fitted in fits:
+        drifts = _drifts_of(problem, fitted, recordings)
+        left = min((line.left for line, _ in drifts), default=np.inf)
+        if left < (1.0 - SMALLEST_SHARE) * least:
+            found, least = drifts, left
+    found = sorted(found, key=lambda drift: drift[0].p_value)
+    return tuple(drift for _, drift in found)
+
+
+def _drifts_of(problem: Problem, fitted: Fit, recordings: Sequence[Recording]):
+    """Return a fit's parameters that drift, each with its line."""
     free = tuple(j for j in fitted.free if j not in fitted.frozen)
     if not free:
-        return ()
+        return []
     lin = clear_differences(problem, fitted.theta, fitted.start, free).linearisation
     chosen = problem.fitted
     when = time_in_recording(problem, recordings)[chosen, :, None]
@@ -61,8 +77,8 @@ def find_drifts(
         both = np.concatenate([constant, growing[..., place : place + 1]], axis=2)
         line = _line(tall(both), residual.ravel(), labels, place)
         if line.p_value * len(free) < SIGNIFICANCE and line.share > SMALLEST_SHARE:
-            found.append((line.p_value, _named(problem, fitted, j, line)))
-    return tuple(drift for _, drift in sorted(found, key=lambda pair: pair[0]))
+            found.append((line, _named(problem, fitted, j, line)))
+    return found
 
 
 class _Line(NamedTuple):
@@ -75,6 +91,7 @@ class _Line(NamedTuple):
         half: Half of the 95 % interval of that.
         p_value: Of there being none.
         share: Of the residual's squares that it explains.
+        left: What it leaves of them.
     """
 
     middle: float
@@ -82,6 +99,7 @@ class _Line(NamedTuple):
     half: float
     p_value: float
     share: float
+    left: float
 
 
 def _line(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray, place: int) -> _Line:
@@ -97,9 +115,10 @@ def _line(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray, place: 
     found = regress(columns, residual, labels)
     change, deviation = found.coefficient[-1], np.sqrt(found.covariance[-1, -1])
     p_value = 2.0 * float(stats.t.sf(abs(change) / max(deviation, 1e-300), found.freedom))
-    share = 1.0 - float(found.rest @ found.rest) / max(float(without @ without), 1e-300)
+    left = float(found.rest @ found.rest)
+    share = 1.0 - left / max(float(without @ without), 1e-300)
     half = float(stats.t.ppf(0.975, found.freedom) * deviation)
-    return _Line(float(found.coefficient[place]), float(change), half, p_value, share)
+    return _Line(float(found.coefficient[place]), float(change), half, p_value, share, left)
 
 
 def _named(problem: Problem, fitted: Fit, j: int, line: _Line) -> Drift:

@@ -215,7 +215,7 @@ def _ladder(
     if few_segments(problem) or not is_above(problem, metric, fits[-1], floor):
         return rungs, measured, ()
     whole = dataclasses.replace(fits[-1], free=tuple(sized_columns(simulator, added)))
-    return rungs, measured, find_drifts(problem, whole, everything)
+    return rungs, measured, find_drifts(problem, [whole], everything)
 
 
 def run_improve(

@@ -121,10 +121,9 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
     found, fitted = [*steps], current
     for place, step in enumerate(steps[:-1]):
         others = [s.effect for s in found if s.effect != step.effect]
-        trials, laws = [], problem.simulator.effects
+        trials = []
         for candidate, contender in step.alike:
-            own = laws[contender.score.effect]
-            if not any(are_exclusive(own, laws[other]) for other in others):
+            if not _excludes(problem, contender, others):
                 trial = under_another_name(problem, fitted, step.contender, contender)
                 if trial is None:
                     say(f"trying {candidate.named} instead of {step.candidate.named}")
@@ -137,6 +136,31 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
         return found, current
     kept, fitted = prune(problem, found, fitted, found, say)
     return (refitted(problem, kept, fitted) if len(kept) == len(found) else kept), fitted
+
+
+def fit_equals(problem: Problem, steps: Sequence[Step], current: Fit, say) -> list[Fit]:
+    """Fit again with what the recordings do not tell from an effect in its place, one at a time.
+
+    Those that are the effect under another name have its fit.
+    """
+    found = []
+    for step in steps:
+        others = [s.effect for s in steps if s.effect != step.effect]
+        for candidate, contender in step.alike:
+            is_told = candidate.named not in step.candidate.indistinguishable_from
+            if is_told or _excludes(problem, contender, others):
+                continue
+            if under_another_name(problem, current, step.contender, contender) is None:
+                say(f"trying {candidate.named} instead of {step.candidate.named}")
+                found.append(_fit_instead(problem, current, others, contender))
+    return found
+
+
+def _excludes(problem: Problem, contender: Contender, others: Sequence[int]) -> bool:
+    """Say whether a contender cannot act beside one of some other effects."""
+    laws = problem.simulator.effects
+    own = laws[contender.score.effect]
+    return any(are_exclusive(own, laws[other]) for other in others)
 
 
 def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others, say) -> Judged:

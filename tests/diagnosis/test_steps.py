@@ -27,7 +27,7 @@ from garat_jax.diagnosis.screen import Score, screen
 from garat_jax.diagnosis.segments import choose_grid
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
-from garat_jax.diagnosis.steps import Step, least_firm, prune, reconsider
+from garat_jax.diagnosis.steps import Step, fit_equals, least_firm, prune, reconsider
 from garat_jax.effects import (
     AsymmetricFriction,
     BackEmf,
@@ -91,16 +91,22 @@ def reconsidered(problem: Problem, first: int, other: int | None, *later: int, n
         later: What was added since.
         named: Whether the recordings could not tell the two apart then.
     """
+    steps = added(problem, first, other, *later, named=named)
+    metric, before = make_metric(problem), steps[-1].fit
+    return *reconsider(problem, metric, steps, before, lambda line: None), before
+
+
+def added(problem: Problem, first: int, other: int | None, *later: int, named: bool = True):
+    """Return the steps of effects that were added; args are those of `reconsidered`."""
     others = [] if other is None else [other]
     alike = [(candidate(effect), contender(problem, effect)) for effect in others]
     own = contender(problem, first)
-    steps, added = [Step(candidate(first, *others[:named]), own, own.fit, alike)], [first]
+    steps, effects = [Step(candidate(first, *others[:named]), own, own.fit, alike)], [first]
     for effect in later:
-        added.append(effect)
-        fitted = fit_with(problem, *added)
+        effects.append(effect)
+        fitted = fit_with(problem, *effects)
         steps.append(Step(candidate(effect), contender(problem, effect), fitted, []))
-    metric, before = make_metric(problem), steps[-1].fit
-    return *reconsider(problem, metric, steps, before, lambda line: None), before
+    return steps
 
 
 def test_an_effect_gives_way_to_one_that_it_was_like_and_that_fits_better_by_now(problem):
@@ -157,6 +163,27 @@ def test_what_cannot_be_told_from_it_beside_the_others_is_named(problem):
     assert [step.effect for step in steps] == [DAMPING, OFFSET]
     assert steps[0].candidate.indistinguishable_from == (Named("back_emf", MOTOR),)
     assert current is before
+
+
+def test_what_is_not_told_from_an_effect_is_fitted_in_its_place(problem):
+    steps = added(problem, DRAG, DAMPING, OFFSET)
+    (found,) = fit_equals(problem, steps, steps[-1].fit, lambda line: None)
+    assert {*found.free} == {DAMPING, OFFSET}
+    assert found.theta[DRAG] == 0.0
+    assert found.theta[DAMPING] == pytest.approx(DAMPED, rel=0.05)
+
+
+def test_what_is_told_from_an_effect_is_not_fitted_in_its_place(problem):
+    steps = added(problem, DRAG, DAMPING, OFFSET, named=False)
+    assert fit_equals(problem, steps, steps[-1].fit, lambda line: None) == []
+
+
+def test_an_effect_is_not_fitted_again_under_another_name(problem):
+    own = contender(problem, DAMPING)
+    same = renamed(own.fit, (DAMPING,), (EMF,), without=problem.simulator.base)
+    other = dataclasses.replace(contender(problem, EMF), fit=same)
+    steps = [Step(candidate(DAMPING, EMF), own, own.fit, [(candidate(EMF), other)])]
+    assert fit_equals(problem, steps, own.fit, lambda line: None) == []
 
 
 def test_what_was_behind_alone_and_is_as_good_in_the_end_is_said_to_be(problem):
