@@ -245,7 +245,7 @@ def _drifts(
     verdict: Verdict,
     say: Callable[[str], None],
 ) -> tuple[Drift, ...]:
-    """Return what drifts of what was found; where a gap stays, or of what is not told from it."""
+    """Return what drifts: of what was found or, where it is unexplained, of what is as good."""
     if outcome.best is None:
         return ()
     fits = [outcome.best]

@@ -4,6 +4,7 @@ Each fitted parameter's sensitivity, times the time within the recording, is hel
 fit left of the residual. Evidence is robust, with blocks of time as the independent units.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,10 +20,11 @@ from garat_jax.diagnosis.starts import Fit
 from garat_jax.effects import unit_at
 
 SIGNIFICANCE = 0.01
-"""Largest p-value, corrected for the number of parameters (Bonferroni)."""
+"""Largest p-value, corrected for the number of parameters of all fits (Bonferroni)."""
 SMALLEST_SHARE = 0.1
-"""Share of what the fit leaves unexplained that a drift must explain, and of what another fit's
-drift leaves by which one of its own has to leave less."""
+"""Share of what the fit leaves unexplained that a drift must explain."""
+MUCH_LESS = 0.9
+"""What the drift of another fit may leave at most to count, relative to what the first leaves."""
 
 
 def time_in_recording(problem: Problem, recordings: Sequence[Recording]) -> np.ndarray:
@@ -42,28 +44,27 @@ def find_drifts(
     """Return the fitted parameters that drift within the recordings, clearest first.
 
     Where the recordings do not tell fits apart whose parameters are constant, a drift may: those of
-    the first fit count unless one of another leaves much less.
+    another than the first fit count if one of them leaves much less than the first does.
 
     Args:
         problem: What was fitted.
         fits: The fits whose parameters are tested, the likely one first.
         recordings: What the segments were cut from, in the order of their indices.
     """
-    found, least = [], np.inf
-    for fitted in fits:
-        drifts = _drifts_of(problem, fitted, recordings)
-        left = min((line.left for line, _ in drifts), default=np.inf)
-        if left < (1.0 - SMALLEST_SHARE) * least:
-            found, least = drifts, left
-    found = sorted(found, key=lambda drift: drift[0].p_value)
-    return tuple(drift for _, drift in found)
+    num_tests = sum(len(fitted.free) for fitted in fits)
+    found, least = _drifts_of(problem, fits[0], recordings, num_tests)
+    for fitted in fits[1:]:
+        drifts, left = _drifts_of(problem, fitted, recordings, num_tests)
+        if drifts and left < MUCH_LESS * least:
+            found, least = [dataclasses.replace(drift, instead=True) for drift in drifts], left
+    return tuple(sorted(found, key=lambda drift: drift.p_value))
 
 
-def _drifts_of(problem: Problem, fitted: Fit, recordings: Sequence[Recording]):
-    """Return a fit's parameters that drift, each with its line."""
+def _drifts_of(problem: Problem, fitted: Fit, recordings: Sequence[Recording], num_tests: int):
+    """Return a fit's parameters that drift, and the least that it leaves with one or none."""
     free = tuple(j for j in fitted.free if j not in fitted.frozen)
     if not free:
-        return []
+        return [], np.inf
     lin = clear_differences(problem, fitted.theta, fitted.start, free).linearisation
     chosen = problem.fitted
     when = time_in_recording(problem, recordings)[chosen, :, None]
@@ -72,13 +73,15 @@ def _drifts_of(problem: Problem, fitted: Fit, recordings: Sequence[Recording]):
     rest = StartSpace(lin.start[chosen]).remove(np.concatenate(parts, axis=2))
     constant, growing, residual = np.split(rest, [len(free), 2 * len(free)], axis=2)
     labels = block_labels(problem)[chosen].ravel()
-    found = []
+    without = regress(tall(constant), residual.ravel(), labels).rest
+    found, least = [], float(without @ without)
     for place, j in enumerate(free):
         both = np.concatenate([constant, growing[..., place : place + 1]], axis=2)
-        line = _line(tall(both), residual.ravel(), labels, place)
-        if line.p_value * len(free) < SIGNIFICANCE and line.share > SMALLEST_SHARE:
-            found.append((line, _named(problem, fitted, j, line)))
-    return found
+        line = _line(tall(both), residual.ravel(), labels, place, without)
+        if line.p_value * num_tests < SIGNIFICANCE and line.share > SMALLEST_SHARE:
+            found.append(_named(problem, fitted, j, line))
+            least = min(least, line.left)
+    return found, least
 
 
 class _Line(NamedTuple):
@@ -102,7 +105,9 @@ class _Line(NamedTuple):
     left: float
 
 
-def _line(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray, place: int) -> _Line:
+def _line(
+    columns: np.ndarray, residual: np.ndarray, labels: np.ndarray, place: int, without: np.ndarray
+) -> _Line:
     """Regress a residual on the parameters and, the last column, one of them times the time.
 
     Args:
@@ -110,8 +115,8 @@ def _line(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray, place: 
         residual: What is to be explained, [M].
         labels: Blocks of time, [M].
         place: Which of the constants grows.
+        without: What the constants alone leave, [M].
     """
-    without = regress(columns[:, :-1], residual, labels).rest
     found = regress(columns, residual, labels)
     change, deviation = found.coefficient[-1], np.sqrt(found.covariance[-1, -1])
     p_value = 2.0 * float(stats.t.sf(abs(change) / max(deviation, 1e-300), found.freedom))

@@ -208,6 +208,8 @@ class Drift:
         change: By how much it changes.
         p_value: Probability of such a change if the parameter is constant.
         share: Share of what the constant parameter leaves unexplained.
+        instead: Whether the effect is not what was added, but what the recordings do not tell from
+            that while it is constant.
     """
 
     effect: str
@@ -218,11 +220,13 @@ class Drift:
     change: Estimate
     p_value: float
     share: float
+    instead: bool = False
 
     def __str__(self) -> str:
         way = "falls" if self.end < self.begin else "rises"
         unit = after_number(self.change.unit)
+        instead = ", taken in place of what was added" if self.instead else ""
         return (
             f"{self.parameter} of {self.effect} at {self.target} {way} from {self.begin:.3g} to "
-            f"{self.end:.3g}{unit} within a recording"
+            f"{self.end:.3g}{unit} within a recording{instead}"
         )

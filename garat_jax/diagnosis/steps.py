@@ -35,6 +35,8 @@ from garat_jax.effects import are_exclusive
 
 NEWCOMERS = 2
 """Candidates fitted in an earlier effect's place, of those that screening puts before it by now."""
+EQUALS = 3
+"""Largest number of what is not told from the effects that were added that is fitted instead."""
 
 
 class Step(NamedTuple):
@@ -141,16 +143,19 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
 def fit_equals(problem: Problem, steps: Sequence[Step], current: Fit, say) -> list[Fit]:
     """Fit again with what the recordings do not tell from an effect in its place, one at a time.
 
-    Those that are the effect under another name have its fit.
+    Of those that shared one fit when they came up, the effect itself or one of the others counts.
     """
     found = []
     for step in steps:
         others = [s.effect for s in steps if s.effect != step.effect]
+        known = [step.contender.fit.residual]
         for candidate, contender in step.alike:
             is_told = candidate.named not in step.candidate.indistinguishable_from
-            if is_told or _excludes(problem, contender, others):
+            is_known = any(contender.fit.residual is residual for residual in known)
+            if is_told or is_known or _excludes(problem, contender, others):
                 continue
-            if under_another_name(problem, current, step.contender, contender) is None:
+            known.append(contender.fit.residual)
+            if len(found) < EQUALS:
                 say(f"trying {candidate.named} instead of {step.candidate.named}")
                 found.append(_fit_instead(problem, current, others, contender))
     return found

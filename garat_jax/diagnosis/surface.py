@@ -2,7 +2,7 @@
 
 Where the cost jumps from one set of parameters to the next, a fit ends in the deepest dip that it
 met. A quadratic through the costs around it (Box and Wilson 1951) is what all of them say, and the
-next one, around its minimum, if that is not near.
+next one, around its minimum, if that is surely not near.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from garat_jax.diagnosis.starts import Fit, follow, follow_each
 OFFSETS = (-2.0, -1.5, -1.0, 1.0, 1.5, 2.0)
 """Where the cost is measured, in half-widths of a 95 % interval; not in the dip itself."""
 WIDENED = 2
-"""How often they are doubled along an axis on which the cost shows no curvature."""
+"""How often axes along which the cost shows no curvature are doubled, at most, for all surfaces."""
 MOVES = 4
 """Largest number of surfaces, each around the minimum of the one before."""
 NEAR = 1.0
@@ -51,8 +51,10 @@ def smooth_minimum(
     correlation = covariance / np.outer(half, half) * sure**2
     share, ways = np.linalg.eigh(correlation)
     axes = half[:, None] * ways * np.sqrt(np.maximum(share, 1e-6))
+    doublings = WIDENED
     while True:
-        axes, move, unsure = _move(problem.take(some), fitted.take(some), columns, axes)
+        near = problem.take(some), fitted.take(some)
+        axes, doublings, move, unsure = _move(*near, columns, axes, doublings)
         theta = fitted.theta.copy()
         theta[columns] = problem.within_bounds(columns, theta[columns] + axes @ move)
         fitted, by = follow(problem, theta, fitted), (theta - fitted.theta)[columns]
@@ -63,14 +65,16 @@ def smooth_minimum(
             return fitted, np.hypot(rough, by) if is_far else rough
 
 
-def _move(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
+def _move(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray, doublings: int):
     """Return how far a surface's minimum is from a fit, and how far it may be from there.
 
+    Axes along which no curvature shows are doubled, so many times at most.
+
     Returns:
-        The axes [k, k], doubled where no curvature shows along them, and both relative to them,
-        [k] each.
+        The axes [k, k], how often they may be doubled yet, and both distances, [k] each, relative
+        to the axes.
     """
-    num_axes, widened = len(columns), 0
+    num_axes = len(columns)
     places = np.empty((len(OFFSETS) * num_axes, num_axes))
     costs, flat = np.empty((len(places), len(fitted.start))), np.ones(num_axes, bool)
     while True:
@@ -78,9 +82,9 @@ def _move(problem: Problem, fitted: Fit, columns: np.ndarray, axes: np.ndarray):
         places[rows], costs[rows] = _around(problem, fitted, columns, axes[:, flat])
         at = np.linalg.solve(axes, places.T).T
         move, unsure, is_curved = _minimum(at, _together(costs, problem.expected))
-        if widened == WIDENED or np.all(is_curved):
-            return axes, move, unsure
-        widened, flat = widened + 1, ~is_curved
+        if not doublings or np.all(is_curved):
+            return axes, doublings, move, unsure
+        doublings, flat = doublings - 1, ~is_curved
         axes = np.where(flat, 2.0, 1.0) * axes
 
 

@@ -178,12 +178,24 @@ def test_what_is_told_from_an_effect_is_not_fitted_in_its_place(problem):
     assert fit_equals(problem, steps, steps[-1].fit, lambda line: None) == []
 
 
-def test_an_effect_is_not_fitted_again_under_another_name(problem):
-    own = contender(problem, DAMPING)
-    same = renamed(own.fit, (DAMPING,), (EMF,), without=problem.simulator.base)
-    other = dataclasses.replace(contender(problem, EMF), fit=same)
-    steps = [Step(candidate(DAMPING, EMF), own, own.fit, [(candidate(EMF), other)])]
-    assert fit_equals(problem, steps, own.fit, lambda line: None) == []
+def test_what_another_excludes_is_not_fitted_beside_it(problem, monkeypatch):
+    monkeypatch.setattr(
+        ViscousDamping, "excludes", lambda self, other: other.kind == "torque_offset"
+    )
+    steps = added(problem, DRAG, DAMPING, OFFSET)
+    assert fit_equals(problem, steps, steps[-1].fit, lambda line: None) == []
+
+
+@pytest.mark.parametrize(("first", "num_fitted"), [(DAMPING, 0), (DRAG, 1)])
+def test_an_effect_is_not_fitted_again_under_another_name(problem, first, num_fitted):
+    """Damping is another name of the back EMF: it needs no fit beside that."""
+    damping = contender(problem, DAMPING)
+    same = renamed(damping.fit, (DAMPING,), (EMF,), without=problem.simulator.base)
+    emf = dataclasses.replace(contender(problem, EMF), fit=same)
+    own = damping if first == DAMPING else contender(problem, first)
+    alike = [(candidate(DAMPING), damping)] * (first != DAMPING) + [(candidate(EMF), emf)]
+    steps = [Step(candidate(first, DAMPING, EMF), own, own.fit, alike)]
+    assert len(fit_equals(problem, steps, own.fit, lambda line: None)) == num_fitted
 
 
 def test_what_was_behind_alone_and_is_as_good_in_the_end_is_said_to_be(problem):

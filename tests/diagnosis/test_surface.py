@@ -164,6 +164,23 @@ def test_a_minimum_that_is_far_along_an_axis_has_to_be_sure_along_it(
     assert len(seen) == surfaces
 
 
+def test_axes_stay_as_wide_as_they_were_needed_and_grow_fourfold_at_most(pair, monkeypatch):
+    lengths, around = [], surface._around
+
+    def measured(problem, fitted, columns, axes):
+        lengths.append(np.linalg.norm(axes[:, -1]))
+        return around(problem, fitted, columns, axes)
+
+    def far_along_the_first_and_flat_along_the_second(at, costs):
+        return np.asarray([1.3, 0.0]), np.asarray([0.1, 2.0]), np.asarray([True, False])
+
+    monkeypatch.setattr(surface, "_around", measured)
+    monkeypatch.setattr(surface, "_minimum", far_along_the_first_and_flat_along_the_second)
+    monkeypatch.setattr(Problem, "within_bounds", lambda problem, columns, values: values)
+    smooth_minimum(*pair)
+    assert np.divide(lengths, lengths[0]) == pytest.approx([1.0, 2.0, 4.0, 4.0, 4.0, 4.0])
+
+
 def test_a_minimum_beyond_a_bound_is_not_gone_to():
     time = np.arange(400) * 0.004
     recordings = [record(time, damping=-0.006, seed=seed) for seed in range(2)]
