@@ -163,6 +163,8 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     if not added:
         return first
     ladder, measured, drifts = _ladder(model, recordings, holdout, added)
+    if drifts and len(added) == len(first.selected):  # its diagnosis tested what is as good, too
+        drifts = first.drifts or drifts
     hidden = measured.finer is not None and not measured.finer.is_explained
     stays = hidden or (last.verdict == "unexplained" and not measured.are_explained)
     verdict: Verdict = "unexplained" if stays else "missing_effect"

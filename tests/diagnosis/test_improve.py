@@ -113,6 +113,20 @@ def test_a_drift_that_the_later_rounds_explain_is_not_said(improved, monkeypatch
     assert _as_one(model, recordings, (), rounds, first.selected).drifts == ()
 
 
+@pytest.mark.parametrize("num_rounds", [1, 2])
+def test_what_is_as_good_may_drift_instead_of_what_one_round_added(
+    improved, monkeypatch, num_rounds
+):
+    done = improved[2]
+    instead = dataclasses.replace(DRIFT, instead=True)
+    measured = ((), HeldOut(done.diagnosis.error), (DRIFT,))
+    monkeypatch.setattr("garat_jax.diagnosis.improve._ladder", lambda *given: measured)
+    first, last = dataclasses.replace(done.rounds[0], drifts=(instead,)), done.rounds[-1]
+    added = first.selected * num_rounds
+    whole = _as_one(done.model, (), (), [first, last], added)
+    assert whole.drifts == ((instead,) if num_rounds == 1 else (DRIFT,))
+
+
 def test_each_recording_alone_shows_the_same_size(improved):
     made, _, done = improved
     (repeated,) = done.diagnosis.repeatability
