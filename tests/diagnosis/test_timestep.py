@@ -331,15 +331,10 @@ def test_what_was_found_is_measured_at_a_finer_timestep_too(monkeypatch, push, e
     before, after = (settle(problem, np.array([x]), problem.segments.start) for x in (1.0, 2.0))
     floor = noise_floor(problem, make_metric(problem), after)
     grid = choose_grid(recordings, 0.004)
-
-    def measured(fits):
-        return measure_held_out(problem, fits, floor, recordings, grid, "held out")
-
-    found = measured((before, after))
+    found = measure_held_out(problem, (before, after), floor, recordings, grid, "held out")
     assert found.error.is_explained
     assert found.finer and found.finer.is_explained is explained
     assert found.are_explained is explained
-    assert measured((before, before)).finer is None
 
 
 def test_a_finer_timestep_tells_nothing_of_a_model_as_it_is_or_where_noise_hides_more(monkeypatch):
