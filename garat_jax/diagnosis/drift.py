@@ -24,7 +24,7 @@ SIGNIFICANCE = 0.01
 SMALLEST_SHARE = 0.1
 """Share of what the fit leaves unexplained that a drift must explain."""
 MUCH_LESS = 0.9
-"""What the drift of another fit may leave at most to count, relative to what the first leaves."""
+"""What the drift of another fit may leave to count, at most, relative to those before it."""
 
 
 def time_in_recording(problem: Problem, recordings: Sequence[Recording]) -> np.ndarray:
@@ -44,7 +44,7 @@ def find_drifts(
     """Return the fitted parameters that drift within the recordings, clearest first.
 
     Where the recordings do not tell fits apart whose parameters are constant, a drift may: those of
-    another than the first fit count if one of them leaves much less than the first does.
+    another fit count if one of them leaves much less than those before it do.
 
     Args:
         problem: What was fitted.

@@ -12,7 +12,8 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.starts import Fit, follow, follow_each
 
 OFFSETS = (-2.0, -1.5, -1.0, 1.0, 1.5, 2.0)
-"""Where the cost is measured, in half-widths of a 95 % interval; not in the dip itself."""
+"""Where the cost is measured along each axis, at first half-widths of a 95 % interval, relative to
+its length; not in the dip itself."""
 WIDENED = 2
 """How often axes along which the cost shows no curvature are doubled, at most, for all surfaces."""
 MOVES = 4
