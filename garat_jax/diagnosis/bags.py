@@ -16,6 +16,8 @@ from garat_jax.errors import UserError, unknown_name
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 """Of single files; a ROS 2 bag is a folder."""
+REORDERED = 0.1
+"""Seconds by which a message's stamp may be before another's that was recorded earlier."""
 _SOURCE = re.compile(r"(?P<topic>[^.\[\]]+)\.(?P<field>[^\[\]]+)(\[(?P<element>[^\[\]]+)\])?")
 
 
@@ -165,6 +167,13 @@ def _series(path: Path, text: str, rows: list[tuple[float, float]]) -> Series:
     if not rows:
         raise UserError(f"{path}: there is no message with {text}")
     time, values = np.asarray(rows).T
+    back = np.maximum.accumulate(time) - time
+    if back.max() > REORDERED:
+        late = int(np.argmax(back > REORDERED))
+        raise UserError(
+            f"{path}: the stamps of {text} go back by {back[late]:.3g} s at message {late + 1}, as "
+            'if a clock began anew; set clock = "log" in the map, or record each run by itself'
+        )
     order = np.argsort(time, kind="stable")
     return Series(time[order], values[order])
 

@@ -16,6 +16,8 @@ WRITTEN_OVER = 1.05
 """Turns that a wrapped angle is written over, at most: one, and noise."""
 JUMP = 0.75
 """Turns that it jumps between two samples, at least."""
+NOT_UNIT = 0.01
+"""Difference of a norm from 1 beyond which four numbers are no rotation."""
 
 
 def with_continuous_quaternions(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
@@ -25,6 +27,11 @@ def with_continuous_quaternions(model: mujoco.MjModel, qpos: np.ndarray) -> np.n
         there = slice(start, start + 4)
         qpos[:, there] = with_one_sign(qpos[:, there])
     return qpos
+
+
+def is_rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Say of each of some quaternions, [T, 4], whether it is one of a rotation, [T] bool."""
+    return np.abs(np.linalg.norm(quaternion, axis=1) - 1) <= NOT_UNIT
 
 
 def with_one_sign(quaternion: np.ndarray) -> np.ndarray:

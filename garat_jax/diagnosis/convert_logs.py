@@ -8,9 +8,10 @@ import numpy as np
 from scipy.io.matlab import mat_struct
 
 from garat_jax.diagnosis.bags import Series, is_bag, read_bag
-from garat_jax.diagnosis.continuous import JUMP, TURN, with_one_sign
+from garat_jax.diagnosis.continuous import JUMP, TURN, is_rotation, with_one_sign
 from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.maps import ColumnMap, read_map
+from garat_jax.diagnosis.measurements import GAP
 from garat_jax.diagnosis.tables import (
     Table,
     check_samples,
@@ -28,7 +29,8 @@ def convert_log(log: Path, map_file: Path, out: Path) -> str:
     """Turn a log into a CSV recording.
 
     Time starts at 0. A bag's topics come at times of their own: the samples are then those of
-    `time` (or, without it, of the first column); states are interpolated, commands are held.
+    `time` (or, without it, of the first column); states are interpolated, but not across gaps,
+    commands are held.
 
     Args:
         log: The log.
@@ -79,6 +81,8 @@ def _from_bag(log: Path, column_map: ColumnMap) -> dict[str, np.ndarray]:
     moving = [series[s] for name, s in sources.items() if not name.startswith("ctrl.")]
     covered = stamps >= max(s.time[0] for s in series.values())
     covered &= stamps <= min((s.time[-1] for s in moving), default=np.inf)
+    for one in moving:
+        covered &= ~_in_gap(one.time, stamps)
     kept = np.concatenate([[True], np.diff(stamps) > 0]) & covered
     if not kept.any():
         raise UserError(f"{log}: the topics in {column_map.path} do not overlap in time")
@@ -91,6 +95,16 @@ def _from_bag(log: Path, column_map: ColumnMap) -> dict[str, np.ndarray]:
     return {"time": time[kept]} | {
         name: _at(one, stamps[kept], name.partition(".")[0]) for name, one in measured.items()
     }
+
+
+def _in_gap(time: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+    """Say which stamps [T] lie in a gap between two of the times of messages, [M]."""
+    if len(time) < 2:
+        return np.zeros(len(stamps), bool)
+    steps = np.diff(time)
+    after = np.clip(np.searchsorted(time, stamps), 1, len(steps))
+    is_gap = steps[after - 1] > GAP * np.median(steps[steps > 0])
+    return is_gap & (stamps > time[after - 1]) & (stamps < time[after])
 
 
 def _at(series: Series, stamps: np.ndarray, kind: str) -> np.ndarray:
@@ -113,19 +127,26 @@ def _at(series: Series, stamps: np.ndarray, kind: str) -> np.ndarray:
 
 
 def _make_quaternions_continuous(measured: dict[str, Series]) -> None:
-    """Give the parts of each quaternion that are logged together one sign throughout."""
-    parts: dict[str, list[str]] = {}
+    """Give the parts of each quaternion that are logged together one sign throughout.
+
+    They are all that a ball joint has, or the last four of a free one, and make a rotation: hinges
+    may have numbers in their names, too.
+    """
+    parts: dict[str, list[int]] = {}
     for name in measured:
         joint, _, number = name.rpartition(".")
         if joint.startswith("qpos.") and number.isdecimal():
-            parts.setdefault(joint, []).append(name)
-    for names in parts.values():
-        names = sorted(names, key=lambda name: int(name.rpartition(".")[2]))[-4:]
+            parts.setdefault(joint, []).append(int(number))
+    for joint, numbers in parts.items():
+        if sorted(numbers) not in ([*range(4)], [*range(7)]):
+            continue
+        names = [f"{joint}.{number}" for number in sorted(numbers)[-4:]]
         times = [measured[name].time for name in names]
-        if len(names) == 4 and all(np.array_equal(time, times[0]) for time in times):
-            values = with_one_sign(np.stack([measured[name].values for name in names], axis=1))
-            for name, time, column in zip(names, times, values.T, strict=True):
-                measured[name] = Series(time, column)
+        if all(np.array_equal(time, times[0]) for time in times):
+            values = np.stack([measured[name].values for name in names], axis=1)
+            if np.all(is_rotation(values)):
+                for name, time, column in zip(names, times, with_one_sign(values).T, strict=True):
+                    measured[name] = Series(time, column)
 
 
 def _mat(log: Path) -> dict[str, np.ndarray]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from garat_jax.diagnosis.columns import actuator_names, signals, torques
 from garat_jax.diagnosis.continuous import (
+    is_rotation,
     unwrapped,
     with_continuous_quaternions,
     wrapped_joints,
@@ -254,7 +255,7 @@ def _unit_quaternions(table: Table, model: mujoco.MjModel, qpos: np.ndarray) -> 
     qpos = qpos.copy()
     for start in quaternions(model):
         norm = np.linalg.norm(qpos[:, start : start + 4], axis=1)
-        bad = np.abs(norm - 1) > 0.01
+        bad = ~is_rotation(qpos[:, start : start + 4])
         if bad.any():
             first, last = (signals(model)[i].name for i in (start, start + 3))
             raise UserError(

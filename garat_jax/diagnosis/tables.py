@@ -186,7 +186,12 @@ def _rows_below(path: Path, header: list[str], separator: str) -> pd.DataFrame:
 
 
 def _read_parquet(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
-    return _numbers(path, _only(path, pd.read_parquet(path), wanted))
+    """Read columns by name; an index that has a name is one of them."""
+    frame = pd.read_parquet(path)
+    if any(name is not None for name in frame.index.names):
+        frame = frame.reset_index()
+    frame.columns = frame.columns.map(str)
+    return _numbers(path, _only(path, frame, wanted))
 
 
 def _only(path: Path, frame: pd.DataFrame, wanted: Collection[str] | None) -> pd.DataFrame:

@@ -4,7 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.diagnosis.test_convert_logs import ANGLE, RATE, STAMPS, convert_only, write_bag
+from tests.diagnosis import test_convert_logs as logs
+from tests.diagnosis.test_convert_logs import ANGLE, RATE, STAMPS, convert_only, stamp, write_bag
 
 AT_HINGE = '"qpos.hinge" = "/joint_states.position[hinge]"'
 
@@ -44,3 +45,37 @@ def test_joints_that_share_a_topic_with_others_are_read(tmp_path, name):
     made = read_between(tmp_path, by_turns, AT_HINGE.replace("[hinge]", f"[{name}]"))
     at = 0.014 + np.arange(len(made)) / RATE
     assert made["qpos.hinge"].to_numpy() == pytest.approx(np.interp(at, STAMPS, ANGLE), abs=0.2)
+
+
+def test_hinges_with_numbers_for_names_keep_their_signs(tmp_path):
+    angles = 0.1 * np.arange(1, 5)[:, None] * np.sin(9 * STAMPS)
+    columns = "\n".join(f'"qpos.arm.{i}" = "/joint_states.position[{i}]"' for i in range(4))
+    made = read_between(tmp_path, lambda k: (["a", "b", "c", "d"], [*angles[:, k]]), columns)
+    at = 0.006 + np.arange(len(made)) / RATE
+    for i in range(4):
+        between = np.interp(at, STAMPS, angles[i])
+        assert made[f"qpos.arm.{i}"].to_numpy() == pytest.approx(between, abs=0.002)
+
+
+def test_states_are_not_invented_across_a_gap(tmp_path):
+    def silent_for_a_while(k):
+        return ([], []) if 20 <= k < 40 else (["hinge"], [ANGLE[k]])
+
+    made = read_between(tmp_path, silent_for_a_while, AT_HINGE)
+    steps = np.diff(made["time"])
+    assert np.count_nonzero(steps > 0.2) == 1
+    assert np.median(steps) == pytest.approx(1 / RATE)
+
+
+def test_a_clock_that_begins_anew_is_refused(tmp_path, capsys, monkeypatch):
+    def begun_anew(store, seconds):
+        return stamp(store, seconds if seconds < 0.3 else seconds - 0.25)
+
+    monkeypatch.setattr(logs, "stamp", begun_anew)
+    log = write_bag(tmp_path, "mcap")
+    columns = f'"ctrl.motor" = "/effort.data"\n{AT_HINGE}'
+    assert convert_only(tmp_path, log, columns) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "go back by 0.24 s at message 31" in line
+    assert 'set clock = "log"' in line
+    assert convert_only(tmp_path, log, columns, 'clock = "log"') == 0

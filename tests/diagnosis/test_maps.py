@@ -61,6 +61,18 @@ def test_parquet_takes_a_map_too(tmp_path):
     assert len(Recording.read(path, MODEL, read_map(write(tmp_path))).time) == 50
 
 
+def test_parquet_whose_columns_are_numbers_and_whose_index_is_time(tmp_path):
+    frame = pd.DataFrame({0: FOREIGN["angle"], 1: FOREIGN["speed"], 2: FOREIGN["torque"]})
+    frame.index = pd.Index(TIME, name="t")
+    frame.to_parquet(tmp_path / "log.parquet")
+    text = MAP.replace('"angle"', '"0"').replace('"speed"', '"1"').replace('"torque"', '"2"')
+    recording = Recording.read(tmp_path / "log.parquet", MODEL, write(tmp_path, text))
+    np.testing.assert_allclose(recording.time, 1e-3 * TIME)
+    np.testing.assert_allclose(recording.ctrl[:, 0], FOREIGN["torque"])
+    with pytest.raises(UserError, match="unknown column 't'"):
+        Recording.read(tmp_path / "log.parquet", MODEL)
+
+
 def test_npz_takes_a_map_too(tmp_path):
     path = tmp_path / "log.npz"
     np.savez(path, **{name: v for name, v in FOREIGN.items() if name != "mode"}, extra=np.eye(2))
