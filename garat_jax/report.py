@@ -18,6 +18,8 @@ import markupsafe
 import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
+from garat_jax.files import write_whole
+
 INK, SOFT, LINE = "#1c2430", "#5a6573", "#e2e6eb"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Distinguishable with colour-vision deficiencies too (Okabe and Ito 2008), in order of use."""
@@ -124,9 +126,7 @@ def write(
         reproduce=reproduce,
         plotly_js=markupsafe.Markup(get_plotlyjs()),
     )
-    path = Path(path)
-    path.write_text(page, encoding="utf-8")
-    return path
+    return write_whole(Path(path), page)
 
 
 def styled(figure: go.Figure, **layout: Any) -> go.Figure:

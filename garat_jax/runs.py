@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from garat_jax.errors import EarlierRunStays, UserError
+from garat_jax.files import write_whole
 from garat_jax.plain import finite_or_null, to_plain
 from garat_jax.provenance import provenance, versions
 
@@ -180,7 +181,7 @@ class RunDirectory:
             ValueError: The value holds a NaN or an infinity.
         """
         text = json.dumps(to_plain(value), indent=2, allow_nan=False) + "\n"
-        return _write_whole(self.path(name), text)
+        return write_whole(self.path(name), text)
 
     def log(self, step: int, **metrics: Any) -> None:
         """Append one line to `metrics.jsonl`; numbers that are not finite become null.
@@ -219,7 +220,7 @@ class RunDirectory:
             return line["step"] <= step or (stage is not None and line.get("stage") != stage)
 
         kept = [line for line in self.metrics() if stays(line)]
-        _write_whole(self.path(METRICS), "".join(json.dumps(line) + "\n" for line in kept))
+        write_whole(self.path(METRICS), "".join(json.dumps(line) + "\n" for line in kept))
 
 
 def is_run(path: Path) -> bool:
@@ -376,10 +377,3 @@ def _check_replaceable(root: Path) -> None:
             f"{root} is the current folder or holds it, so it is left alone; "
             "change the folder first, or give another --out"
         )
-
-
-def _write_whole(path: Path, text: str) -> Path:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
-    return path

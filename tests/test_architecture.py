@@ -64,7 +64,15 @@ def test_import_contracts_hold():
 def test_an_upward_import_breaks_the_contracts(tmp_path):
     package = tmp_path / "garat_jax"
     package.mkdir()
-    words = ("commandline", "compilation_cache", "errors", "interrupt", "plain", "provenance")
+    words = (
+        "commandline",
+        "compilation_cache",
+        "errors",
+        "interrupt",
+        "files",
+        "plain",
+        "provenance",
+    )
     for name in ("__init__", "cli", "report", "summary", *words):
         (package / f"{name}.py").touch()
     (package / "runs.py").write_text("from garat_jax import cli\n")

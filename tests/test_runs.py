@@ -131,7 +131,7 @@ def test_a_file_that_a_killed_process_had_not_finished_is_no_result(tmp_path):
     run = create(tmp_path / "run", seeds=[7])
     run.path("stages/one.json")
     run.write_json("seconds.json", {"compile": 20.0})  # of the first program
-    (tmp_path / "run" / ".seconds.json.123.tmp").write_text("{")
+    (tmp_path / "run" / ".123.seconds.json").write_text("{")
     assert put_back_earlier(tmp_path / "run")
     assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1
 

@@ -148,8 +148,10 @@ def writing(path: Path, suffix: str, force: bool) -> Iterator[None]:
     try:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with path.open("r+b") if path.exists() else tempfile.TemporaryFile(dir=path.parent):
+            with tempfile.TemporaryFile(dir=path.parent):
                 pass
+            if path.exists():
+                path.open("r+b").close()
         except OSError as error:
             raise UserError(f"--out {path} cannot be written: {error}") from error
         yield

@@ -9,6 +9,7 @@ import numpy as np
 
 from garat_jax.diagnosis.tables import read_mat, read_table
 from garat_jax.errors import UserError
+from garat_jax.files import write_whole, written_whole
 
 FREE_PENDULUM_FILE = "SinglePendulumDataForParameterEstimation.mat"
 # dynamicslab/MultiArm-Pendulum (MIT), EstimatedParameters_SinglePendulum.mat: distance to the
@@ -150,7 +151,10 @@ def motor_pendulum(
 def write_csv(path: Path, columns: Mapping[str, np.ndarray]) -> Path:
     """Write columns of equal length as a CSV file and return its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with (
+        written_whole(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(columns)
         rows = zip(*columns.values(), strict=True)
@@ -160,5 +164,4 @@ def write_csv(path: Path, columns: Mapping[str, np.ndarray]) -> Path:
 
 def _write_text(path: Path, text: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    return path
+    return write_whole(path, text)

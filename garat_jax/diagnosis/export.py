@@ -13,6 +13,7 @@ from garat_jax.effects import Effect, in_order
 from garat_jax.effects.joint import TorqueOffset
 from garat_jax.effects.motor_apart import Transmission
 from garat_jax.errors import UserError
+from garat_jax.files import written_whole
 
 
 class Exported(NamedTuple):
@@ -60,14 +61,14 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
     except ValueError as error:
         raise UserError(f"MuJoCo cannot compile the model: {error}") from error
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    try:
-        mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        path.unlink()
-        raise UserError(
-            f"{path}: MuJoCo cannot read the model back: {' '.join(str(error).split())}"
-        ) from error
+    with written_whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+        try:
+            mujoco.MjModel.from_xml_path(str(temporary))
+        except ValueError as error:
+            raise UserError(
+                f"{path}: MuJoCo cannot read the model back: {' '.join(str(error).split())}"
+            ) from error
     return Exported(path, unsaid)
 
 

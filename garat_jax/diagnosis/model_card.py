@@ -22,6 +22,7 @@ from garat_jax.effects.catalogue import Catalogue, choose_kind, load_catalogue
 from garat_jax.effects.elements import element_names
 from garat_jax.env import Task, TaskEnv, Transform, World
 from garat_jax.errors import UserError, unknown_name
+from garat_jax.files import write_whole
 from garat_jax.overrides import load_spec
 
 FORMAT = "garat-model/1"
@@ -176,8 +177,7 @@ def save_card(path: str | Path, model: Model, extra_effects: Sequence[Effect] = 
         values = (f"{name} = {_toml(getattr(effect, name))}" for name in names)
         lines += ["", "[[effect]]", f"kind = {_toml(effect.kind)}"]
         lines += [f"target = {_toml(effect.target)}", f"parameters = {{ {', '.join(values)} }}"]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+    return write_whole(path, "\n".join(lines) + "\n")
 
 
 def mjcf_in_card(path: Path, model: Model) -> str:
