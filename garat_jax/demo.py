@@ -45,7 +45,9 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
     seeds = range(seed, seed + config.seeds)
     part = _part(run, "transfer", {"pair": PAIR}, seeds, resume=run.resumed)
     transfer = run_transfer(config, part)
-    Console(highlight=False, markup=False, soft_wrap=True).print(summary.describe(transfer))
+    Console(highlight=False, markup=False, emoji=False, soft_wrap=True).print(
+        summary.describe(transfer)
+    )
 
     console.rule("2. A hidden effect: which physics does the model lack?")
     hidden = make_recordings(PENDULUM, run.path("measurements"), seed)

@@ -1,8 +1,8 @@
-"""Files that are written whole or not at all. No JAX."""
+"""Files: written whole or not at all, and told apart by their names. No JAX."""
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 
@@ -26,3 +26,15 @@ def write_whole(path: Path, text: str) -> Path:
     with written_whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
+
+
+def distinct_names(paths: Collection[Path]) -> dict[Path, str]:
+    """Name files by the last parts of their paths, as many of them as tell all files apart."""
+    names: dict[Path, str] = {}
+    whole = {path: path.absolute() for path in paths}
+    longest = max((len(path.parts) for path in whole.values()), default=1)
+    for num in range(1, longest + 1):
+        names = {path: Path(*w.parts[-num:]).as_posix() for path, w in whole.items()}
+        if len({*names.values()}) == len({*whole.values()}):
+            break
+    return names

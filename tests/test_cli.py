@@ -8,7 +8,7 @@ import pytest
 
 from garat_jax import cli
 from garat_jax.commandline import how_to_go_on, parse
-from garat_jax.commands.console import make_run, writing
+from garat_jax.commands.console import make_run, print_table, say, writing
 from garat_jax.errors import DivergedError, UserError, nearest, unknown_name
 from garat_jax.runs import RunDirectory, earlier_run_kept
 from tests.test_split import free_port
@@ -161,6 +161,14 @@ class Failing:
 @pytest.fixture
 def failing(monkeypatch):
     monkeypatch.setitem(cli.COMMANDS, "fail", Failing)
+
+
+def test_names_are_printed_as_they_are(capsys):
+    say("joint/robot:leg: [b]1[/b]")
+    print_table(["joint"], [["left:hand:"]])
+    printed = capsys.readouterr().out
+    assert "joint/robot:leg: [b]1[/b]" in printed
+    assert "left:hand:" in printed
 
 
 def test_an_error_is_one_line(failing, capsys):

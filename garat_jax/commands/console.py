@@ -32,7 +32,7 @@ def complain(message: str, status: int) -> int:
 
 def say(message: str) -> None:
     """Print one line on stdout, as it is."""
-    Console(soft_wrap=True, highlight=False, markup=False).print(message)
+    Console(soft_wrap=True, highlight=False, markup=False, emoji=False).print(message)
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -42,7 +42,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         table.add_row(*row)
     console = Console()
     width = console.width if console.is_terminal else max(console.width, 160)
-    Console(width=width, markup=False).print(table)
+    Console(width=width, markup=False, emoji=False).print(table)
 
 
 @contextlib.contextmanager

@@ -39,6 +39,7 @@ from garat_jax.diagnosis.unseen import STILL, is_still
 from garat_jax.dynamics import native_model
 from garat_jax.effects.catalogue import Catalogue
 from garat_jax.effects.elements import element_names
+from garat_jax.files import distinct_names
 from garat_jax.plain import finite_or_null, to_plain
 from garat_jax.provenance import versions
 from garat_jax.runs import RunDirectory
@@ -241,11 +242,22 @@ def run_compare(
 
 
 def read_recordings(
-    model: Model, paths: Sequence[Path], columns: Path | None = None
+    model: Model,
+    paths: Sequence[Path],
+    columns: Path | None = None,
+    among: Sequence[Path] = (),
 ) -> list[Recording]:
-    """Read recordings of a model, their columns as a map file says, and tell their warnings."""
+    """Read recordings of a model, and tell their warnings.
+
+    Args:
+        model: The model.
+        paths: The files.
+        columns: Map of their columns.
+        among: All files of which the recordings' names tell each apart, if those are more.
+    """
     column_map = read_map(columns) if columns else None
-    recordings = [Recording.read(path, model, column_map) for path in paths]
+    names = distinct_names([*paths, *among])
+    recordings = [Recording.read(path, model, column_map, names[path]) for path in paths]
     for recording in recordings:
         for warning in recording.warnings:
             tell(f"warning: {warning}")

@@ -6,6 +6,8 @@ effect of another size. At the end all parameters are fitted to all recordings.
 """
 
 import dataclasses
+import functools
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -92,12 +94,18 @@ def add_conditions(
     return dataclasses.replace(base, conditions=found)
 
 
-def read_conditions(
-    model: Model, conditions: Mapping[str, Sequence[Path]] | None, columns: Path | None = None
-) -> dict[str, tuple[Recording, ...]]:
-    """Read the recordings of each condition; see `read_recordings`."""
-    named = (conditions or {}).items()
-    return {name: tuple(read_recordings(model, paths, columns)) for name, paths in named}
+def read_all(
+    model: Model,
+    data: Sequence[Path],
+    holdout: Sequence[Path],
+    conditions: Mapping[str, Sequence[Path]] | None,
+    columns: Path | None = None,
+) -> tuple[list[Recording], list[Recording], dict[str, list[Recording]]]:
+    """Read recordings, those held out and those of each condition; see `read_recordings`."""
+    others = conditions or {}
+    everything = [*data, *holdout, *itertools.chain.from_iterable(others.values())]
+    read = functools.partial(read_recordings, model, columns=columns, among=everything)
+    return read(data), read(holdout), {name: read(paths) for name, paths in others.items()}
 
 
 def check_conditions(model: Model, conditions: Mapping[str, Sequence[Recording]]) -> None:

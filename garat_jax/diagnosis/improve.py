@@ -10,11 +10,10 @@ import numpy as np
 import plotly.graph_objects as go
 
 from garat_jax import report
-from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.conditions import (
     add_conditions,
     check_conditions,
-    read_conditions,
+    read_all,
     write_cards,
 )
 from garat_jax.diagnosis.diagnose import diagnose, few_segments, make_candidates, split, thin
@@ -247,8 +246,7 @@ def run_improve(
         UserError: A file cannot be read, does not fit the model, or cannot be copied.
     """
     loaded = load_model(model, catalogue)
-    recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
-    others = read_conditions(loaded, conditions, columns)
+    recordings, held_out, others = read_all(loaded, data, holdout, conditions, columns)
     needed_files(loaded)  # or the refusal would come at the end
     with progress("looking at the recordings") as say:
         done = improve(loaded, recordings, held_out, say, others)

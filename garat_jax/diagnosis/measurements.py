@@ -46,7 +46,7 @@ class Recording:
     """One recording of the real machine.
 
     Attributes:
-        name: File name.
+        name: What it is called: its file's name, unless another was given.
         time: Seconds, strictly increasing, [T].
         qpos: Positions, [T, nq].
         qvel: Velocities, [T, nv]; measured, or estimated from the positions.
@@ -82,6 +82,7 @@ class Recording:
         path: str | Path,
         model: Model | mujoco.MjModel,
         column_map: ColumnMap | str | Path | None = None,
+        name: str = "",
     ) -> "Recording":
         """Read and check a recording of a model.
 
@@ -90,6 +91,7 @@ class Recording:
             model: The model, which names the columns.
             column_map: How the file names its columns, and in which units: a map file, or what
                 `read_map` made of one.
+            name: What to call it; the file's name if that is empty.
 
         Raises:
             UserError: The file cannot be read or does not fit the model; one line says where and
@@ -106,20 +108,21 @@ class Recording:
         check_samples(table)
         columns = table.columns
         time = columns["time"]
-        spans, warnings = _split(table.path, time)
+        name = name or table.path.name
+        spans, warnings = _split(table.path, name, time)
         names = signals(model)
         qpos = _stack(columns, [s.name for s in names[: model.nq]], len(time))
         qpos = with_continuous_quaternions(model, _unit_quaternions(table, model, qpos))
         wrapped = wrapped_joints(model, qpos, spans)
         qpos = unwrapped(model, qpos, wrapped)
-        warnings += [_said_of_wrapped(table.path, model, joint) for joint in wrapped]
+        warnings += [_said_of_wrapped(name, model, joint) for joint in wrapped]
         if velocity_measured:
             qvel = _stack(columns, [s.name for s in names[model.nq :]], len(time))
         else:
             qvel = _estimate(model, time, qpos, spans)
         ctrl = _stack(columns, ["ctrl." + name for name in actuator_names(model)], len(time))
         recording = cls(
-            name=table.path.name,
+            name=name,
             time=time,
             qpos=qpos,
             qvel=qvel,
@@ -159,6 +162,12 @@ def _read(path: str | Path, model: mujoco.MjModel, column_map: ColumnMap | None)
     column_map.check({"time": "s", **{s.name: s.unit for s in (*signals(model), *torques(model))}})
     raw = read_table(path, column_map.sources)
     return Table(raw.path, column_map.apply(raw.columns))
+
+
+def find_gaps(time: np.ndarray) -> np.ndarray:
+    """Return the indices of the samples, of those at some times [T], after which there is a gap."""
+    steps = np.diff(time)
+    return np.flatnonzero(steps > GAP * np.median(steps))
 
 
 def longest_span(recordings: Sequence[Recording]) -> float:
@@ -221,11 +230,11 @@ def _missing(table: Table, name: str, wanted: Collection[str]) -> UserError:
     return UserError(f"{table.path}: missing column {name!r} ({purpose}); {there}")
 
 
-def _split(path: Path, time: np.ndarray) -> tuple[tuple[tuple[int, int], ...], list[str]]:
+def _split(
+    path: Path, name: str, time: np.ndarray
+) -> tuple[tuple[tuple[int, int], ...], list[str]]:
     """Return the spans between gaps, and what to say about them."""
-    steps = np.diff(time)
-    usual = float(np.median(steps))
-    gaps = np.flatnonzero(steps > GAP * usual)
+    gaps, usual = find_gaps(time), float(np.median(np.diff(time)))
     borders = [0, *(int(gap) + 1 for gap in gaps), len(time)]
     parts = list(itertools.pairwise(borders))
     spans = tuple((a, b) for a, b in parts if b - a >= FEWEST_SAMPLES)
@@ -242,7 +251,7 @@ def _split(path: Path, time: np.ndarray) -> tuple[tuple[tuple[int, int], ...], l
     into = f"{len(spans)} part{'s' if len(spans) > 1 else ''}"
     lost = f"; {dropped} samples in shorter parts are left out" if dropped else ""
     return spans, [
-        f"{path.name}: {len(gaps)} gap{'s' if len(gaps) > 1 else ''} ({where} s after the start, "
+        f"{name}: {len(gaps)} gap{'s' if len(gaps) > 1 else ''} ({where} s after the start, "
         f"usual step {usual:g} s); split there into {into}{lost}"
     ]
 
@@ -266,9 +275,9 @@ def _unit_quaternions(table: Table, model: mujoco.MjModel, qpos: np.ndarray) -> 
     return qpos
 
 
-def _said_of_wrapped(path: Path, model: mujoco.MjModel, joint: int) -> str:
-    name = signals(model)[model.jnt_qposadr[joint]].name
-    return f"{path.name}: {name} jumps by a turn and is taken to go on turning"
+def _said_of_wrapped(name: str, model: mujoco.MjModel, joint: int) -> str:
+    position = signals(model)[model.jnt_qposadr[joint]].name
+    return f"{name}: {position} jumps by a turn and is taken to go on turning"
 
 
 def _estimate(model: mujoco.MjModel, time, qpos, spans) -> np.ndarray:

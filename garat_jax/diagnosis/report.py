@@ -24,6 +24,7 @@ from garat_jax.diagnosis.report_data import (
     side_by_side_section,
     torque_section,
     unseen_section,
+    warnings_section,
 )
 from garat_jax.diagnosis.report_effects import (
     ladder_section,
@@ -76,9 +77,13 @@ def diagnosis_lead(diagnosis: Diagnosis) -> str:
 
 
 def _with_warnings(lead: str, warnings: Sequence[str]) -> str:
-    shown = [f"{warning[0].upper()}{warning[1:]}." for warning in warnings[:MOST_WARNINGS]]
-    more = len(warnings) - len(shown)
-    return " ".join([lead, *shown, *([f"There are {more} more warnings."] if more > 0 else [])])
+    """Add the first warnings, as they are: many begin with a file's name."""
+    if not warnings:
+        return lead
+    more = len(warnings) - MOST_WARNINGS
+    rest = f"; and {more} more, below" if more > 0 else ""
+    told = f"{lead} Warnings: {'; '.join(warnings[:MOST_WARNINGS])}{rest}"
+    return told if told.endswith("?") else f"{told}."
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
@@ -161,6 +166,7 @@ def diagnosis_sections(
         *repeatability_section(diagnosis),
         *next_section(diagnosis),
         *left_section(diagnosis),
+        *warnings_section(diagnosis.warnings, MOST_WARNINGS),
     ]
 
 
@@ -195,6 +201,7 @@ def write_comparison(
             *torque_section(comparison.torques),
             *([] if comparison.near_noise else _where(comparison.where, view)),
             recordings_section(comparison.recordings),
+            *warnings_section(comparison.warnings, MOST_WARNINGS),
         ],
         reproduce=Reproduce.from_config(run.read_json("config.json")),
     )

@@ -40,12 +40,10 @@ def recordings_section(recordings: Sequence[Quality]) -> Section:
         for q in recordings
         for name, c in q.channels.items()
     ]
-    warnings = [warning for q in recordings for warning in q.warnings]
-    odd = "\n\n" + "\n".join(f"- {warning}" for warning in warnings) if warnings else ""
     return Section(
         "What the recordings are worth",
         "Noise and steps of the sensors limit what any model can predict. A command lag means that "
-        "the torque, as the motion shows it, follows the recorded command that much later." + odd,
+        "the torque, as the motion shows it, follows the recorded command that much later.",
         tables=[
             Table(
                 [
@@ -255,6 +253,12 @@ def unseen_section(unseen: Sequence[Unseen]) -> list[Section]:
     )
     table = Table(["effect", "place", "parameters", "hidden"], rows)
     return [Section("What these recordings cannot show", text, tables=[table])]
+
+
+def warnings_section(warnings: Sequence[str], known: int) -> list[Section]:
+    """Return all warnings; nothing if a reader knows so many of them already."""
+    lines = "\n".join(f"- {warning}" for warning in warnings)
+    return [Section("All warnings", lines)] if len(warnings) > known else []
 
 
 def next_section(diagnosis: Diagnosis) -> list[Section]:

@@ -7,15 +7,14 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.conditions import (
     add_conditions,
     check_conditions,
-    read_conditions,
+    read_all,
     write_cards,
 )
 from garat_jax.diagnosis.diagnose import diagnose_keeping
-from garat_jax.diagnosis.export import copy_model
+from garat_jax.diagnosis.export import copy_model, needed_files
 from garat_jax.diagnosis.model_card import load_model
 from garat_jax.diagnosis.progress import progress
 from garat_jax.diagnosis.repeat import repeatability
@@ -61,10 +60,10 @@ def run_diagnose(
         UserError: A file cannot be read, does not fit the model, or cannot be copied.
     """
     loaded = load_model(model, catalogue)
-    recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
-    others = read_conditions(loaded, conditions, columns)
+    recordings, held_out, others = read_all(loaded, data, holdout, conditions, columns)
     check_conditions(loaded, others)
-    copied = copy_model(loaded, run.path("model")) if others else loaded.mjcf
+    if others:
+        needed_files(loaded)  # or the refusal would come at the end
     with progress("looking at the recordings") as say:
         base, simulator = diagnose_keeping(loaded, recordings, held_out, say)
         diagnosis = add_conditions(loaded, base, recordings, others, held_out, say)
@@ -73,10 +72,11 @@ def run_diagnose(
         )
         run.write_json("diagnosis.json", diagnosis.to_json())
         if others:
+            copied = copy_model(loaded, run.path("model"))
             write_cards(run, dataclasses.replace(loaded, mjcf=copied), diagnosis)
         say("writing the report")
         sections = diagnosis_sections(diagnosis, loaded, recordings, held_out)
         sections += condition_sections(diagnosis, loaded, others)
         write_diagnosis(run, diagnosis, loaded.name, sections)
-    Console(highlight=False, markup=False, soft_wrap=True).print(str(diagnosis))
+    Console(highlight=False, markup=False, emoji=False, soft_wrap=True).print(str(diagnosis))
     return Diagnosed(diagnosis, sections)

@@ -66,7 +66,8 @@ def run_ground(
         UserError: A file cannot be read, does not fit the model, or cannot be copied.
     """
     loaded = load_model(model, catalogue)
-    recordings, held_out = (read_recordings(loaded, paths, columns) for paths in (data, holdout))
+    both = (*data, *holdout)
+    recordings, held_out = (read_recordings(loaded, p, columns, both) for p in (data, holdout))
     acting = load_policy(policy, loaded, recordings) if policy else None
     files = [model, *data, *holdout, *(path for path in (columns, policy) if path)]
     for kind, law in (catalogue or {}).items():

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import re
+import shutil
 from typing import cast
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 
 from garat_jax.cli import main
 from garat_jax.diagnosis import load_model, run_diagnose
-from garat_jax.diagnosis.conditions import JointSimulator, diagnose_conditions
+from garat_jax.diagnosis import run as diagnosis_run
+from garat_jax.diagnosis.conditions import JointSimulator, diagnose_conditions, read_all
 from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.improve import improve, run_improve
 from garat_jax.diagnosis.segments import Segments
@@ -194,6 +196,30 @@ def test_a_condition_without_a_file_is_refused(tmp_path, capsys):
         for command in ("diagnose", "improve"):
             assert main([command, str(model), str(data), "--condition", word]) == 2
             assert said in capsys.readouterr().err
+
+
+def test_files_of_one_name_are_told_apart_in_all_that_is_read(files, tmp_path):
+    paths = [tmp_path / day / "run.csv" for day in ("day1", "day2", "day3")]
+    for path in paths:
+        path.parent.mkdir()
+        shutil.copy(files / "base_0.csv", path)
+    data, held_out, others = read_all(MODEL, paths[:1], paths[1:2], {"cable": paths[2:]})
+    names = [recording.name for recording in (*data, *held_out, *others["cable"])]
+    assert names == ["day1/run.csv", "day2/run.csv", "day3/run.csv"]
+
+
+def test_an_earlier_run_stays_where_a_diagnosis_of_conditions_fails(files, tmp_path, monkeypatch):
+    def fail(*_):
+        raise UserError("no luck")
+
+    monkeypatch.setattr(diagnosis_run, "diagnose_keeping", fail)
+    earlier = RunDirectory.create(tmp_path / "run", {}, "garat diagnose", [])
+    earlier.write_json("diagnosis.json", {})
+    given = [files / "pendulum.xml", files / "base_0.csv", "--condition"]
+    given += [f"cable={files / 'pulled_0.csv'}", "--out", earlier.root, "--force"]
+    assert main(["diagnose", *map(str, given)]) == 2
+    assert (earlier.root / "diagnosis.json").exists()
+    assert not (earlier.root / "model").exists()
 
 
 @pytest.mark.parametrize("find", [diagnose_conditions, improve_under])

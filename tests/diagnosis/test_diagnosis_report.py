@@ -19,6 +19,7 @@ from garat_jax.diagnosis.report import (
     diagnosis_sections,
     write_diagnosis,
 )
+from garat_jax.diagnosis.report_data import warnings_section
 from garat_jax.diagnosis.results import Errors, Experiment, Rung
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
@@ -298,6 +299,16 @@ def test_page_of_an_unexplained_gap_says_what_is_left_and_offers_to_learn_it(tmp
 )
 def test_lead_says_the_verdict(changes, said):
     assert said in diagnosis_lead(dataclasses.replace(MISSING, **changes))
+
+
+def test_more_warnings_than_a_lead_has_are_listed():
+    warnings = tuple(f"run{i}.csv: 1 gap" for i in range(5))
+    lead = diagnosis_lead(dataclasses.replace(MISSING, warnings=warnings))
+    named = "; ".join(warnings[:3])
+    assert lead.endswith(f" Warnings: {named}; and 2 more, below.")
+    (section,) = warnings_section(warnings, 3)
+    assert section.text.splitlines() == [f"- {warning}" for warning in warnings]
+    assert warnings_section(warnings[:3], 3) == []
 
 
 def what_is_left(model, recordings, selected):

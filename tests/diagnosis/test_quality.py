@@ -89,8 +89,10 @@ def test_without_excitation_no_lag_is_claimed(tmp_path):
 
 def test_rate_noise_and_gaps_are_told(tmp_path):
     _, recordings = record(tmp_path, seconds=4.0, rate=200.0)
-    quality = assess(dataclasses.replace(recordings[0], spans=((0, 400), (400, 800))), MODEL)
-    assert (quality.samples, quality.gaps, quality.velocity) == (800, 1, "measured")
+    time = recordings[0].time + np.repeat([0.0, 1.0, 2.0], [400, 10, 390])
+    split = dataclasses.replace(recordings[0], time=time, spans=((0, 400), (410, 800)))
+    quality = assess(split, MODEL)
+    assert (quality.samples, quality.gaps, quality.velocity) == (800, 2, "measured")
     assert quality.rate == pytest.approx(200.0)
     assert quality.irregularity < 1e-6
     assert quality.channels["qpos.hinge"].noise == pytest.approx(ANGLE_NOISE, rel=0.2)
