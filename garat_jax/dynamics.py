@@ -230,11 +230,11 @@ def lead(
 ) -> PhysicsState:
     """Do a `step` in which the mechanism is led along a path, whatever moves it.
 
-    Motors turn against the joints that are led, and sensors note; activations stay.
+    Motors turn against the joints that are led, actuators are activated and sensors note.
 
     Args:
         dynamics: The physics.
-        state: One simulation's state; of it the memory goes on.
+        state: One simulation's state; of it the memory goes on, and the activation.
         ctrl: Command, [nu].
         qpos: Positions at the start of the substeps, [num_substeps, nq].
         qvel: Velocities that led there, [num_substeps, nv].
@@ -247,6 +247,8 @@ def lead(
         return memory, None
 
     memory, _ = jax.lax.scan(substep, state.memory, (qpos, qvel))
+    if dynamics.host.model.na:
+        state = state._replace(act=move(dynamics, state, ctrl, len(qpos)).act)
     state = state._replace(qpos=qpos[-1], qvel=qvel[-1], memory=memory)
     return note(dynamics, state, len(qpos) * dynamics.timestep)
 

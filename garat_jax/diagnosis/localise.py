@@ -19,6 +19,7 @@ from scipy import signal
 from garat_jax.diagnosis.activation import LONGEST, follow_commands, forgets_in, known_spans
 from garat_jax.diagnosis.columns import signals, torques
 from garat_jax.diagnosis.filters import even_steps, held, interpolated
+from garat_jax.diagnosis.tables import FEWEST_SAMPLES
 from garat_jax.dynamics import Dynamics, apply_effects, initial_state, view
 from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
 from garat_jax.effects.gear import gear_of
@@ -111,13 +112,19 @@ def missing_torque(
     parts = [
         _of_span(model, r, act, slice(*span), world)
         for r, act in zip(recordings, activations, strict=True)
-        for span in known_spans(r, forgets_in(model)) or r.spans
+        for span in _known(r, forgets_in(model))
     ]
     stacked = [np.concatenate(columns) for columns in zip(*parts, strict=True)]
     actuators = tuple(element_names(model, "actuator"))
     slides = tuple(signal.unit == "m/s" for signal in signals(model)[model.nq :])
     dofs = tuple(torque.name.removeprefix("torque.") for torque in torques(model))
     return MissingTorque(dofs, actuators, slides, *stacked)
+
+
+def _known(recording: "Recording", seconds: float) -> Sequence[tuple[int, int]]:
+    """Return the spans in which activations are known, long enough to be smoothed; all if none."""
+    known = known_spans(recording, seconds)
+    return [(a, b) for a, b in known if b - a >= FEWEST_SAMPLES] or recording.spans
 
 
 def localise(missing: MissingTorque) -> list[Place]:

@@ -330,23 +330,33 @@ class Simulator:
                 return command
             return self._transform(whole(dynamics.sensed(world, state)), command)
 
-        def hold(state, command):
-            return dynamics.hold(world, state, commanded(state, command), self._substeps), None
+        def since_begun(has_begun, new, old):
+            if not self.host.na:  # an integrator would go on with the first command
+                return new
+            return new._replace(act=jnp.where(has_begun, new.act, old.act))
+
+        def hold(state, step):
+            command, has_begun = step
+            held = dynamics.hold(world, state, commanded(state, command), self._substeps)
+            return since_begun(has_begun, held, state), None
 
         def lead(state, step):
-            command, *path = step
-            return dynamics.lead(world, state, commanded(state, command), *path), None
+            (command, *path), has_begun = step
+            led = dynamics.lead(world, state, commanded(state, command), *path)
+            return since_begun(has_begun, led, state), None
 
         def advance(state, command):
             state = dynamics.step(world, state, commanded(state, command), self._substeps)
             return state, (whole(dynamics.sensed(world, state)), whole(state))
 
-        steps = past.num_steps - num_before + jnp.arange(self._warm_up) if leads else 0
-        warm_up = past.ctrl[past.recording, jnp.maximum(steps, 0)] if leads else ctrl
-        state, _ = jax.lax.scan(hold, state, warm_up[: self._warm_up])
+        looks_back = leads or self.host.na > 0
+        steps = (past.num_steps if looks_back else num_before) - num_before + np.arange(num_before)
+        before, after = steps[: self._warm_up], steps[self._warm_up :]
+        warm_up = past.ctrl[past.recording, jnp.maximum(before, 0)] if leads else ctrl
+        state, _ = jax.lax.scan(hold, state, (warm_up[: self._warm_up], before >= 0))
         if leads:
             way = way_to(start, past, self.host, self._grid, self._substeps)
-            state, _ = jax.lax.scan(lead, state, way)
+            state, _ = jax.lax.scan(lead, state, (way, after >= 0))
         _, paths = jax.lax.scan(advance, state, ctrl[self._warm_up :])
         firsts = (whole(dynamics.sensed(world, state)), whole(state))
         signals, true = (

@@ -12,7 +12,9 @@ from garat_jax.diagnosis.activation import follow_commands, forgets_in, known_sp
 from garat_jax.diagnosis.localise import missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.oddities import oddities
-from garat_jax.diagnosis.segments import grid_for
+from garat_jax.diagnosis.segments import cut, grid_for
+from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.effects import JointFlexibility
 from garat_jax.errors import UserError
 from tests import models
 
@@ -83,11 +85,67 @@ def test_an_integrator_begins_without_a_force_and_says_so():
     assert "actuator motor integrates its commands, and where it began is not recorded" in line
 
 
+def errors_of_a_perfect_model(folder, mjcf, ctrl, *effects):
+    """Return the largest error of the last joint in each segment that is whole, of 0.5 s."""
+    path = folder / "perfect.xml"
+    path.write_text(mjcf)
+    model = load_model(path)
+    host = model.compile("mujoco").host.model
+    data, rows = mujoco.MjData(host), []
+    data.act[:] = ctrl[0, -1] if host.actuator_dyntype[-1] != mujoco.mjtDyn.mjDYN_INTEGRATOR else 0
+    for command in ctrl:
+        rows.append((data.qpos.copy(), data.qvel.copy()))
+        data.ctrl[:] = command
+        mujoco.mj_step(host, data, 2)
+    state = [np.asarray(column) for column in zip(*rows, strict=True)]
+    num = len(ctrl)
+    time = np.arange(num) * 2 * host.opt.timestep
+    made = Recording("made", time, *state, ctrl, {}, True, ((0, num),), ())
+    grid = grid_for([made], host)
+    segments = cut([made], grid, 0.5)
+    simulator = Simulator(dataclasses.replace(model, effects=effects), (), grid)
+    predicted = simulator.predict(simulator.base[None], segments.start[None], segments)[0]
+    error = np.abs(predicted - segments.measured)[..., host.nq - 1].max(axis=1)
+    return error[segments.weight.min(axis=1) > 0]
+
+
+def test_an_integrator_is_given_no_commands_before_its_recording(tmp_path):
+    ctrl = 0.8 * np.cos(3 * np.arange(400) * 2 * 0.002)[:, None]
+    mjcf_of_velocity = models.PENDULUM.replace("<motor", '<intvelocity kp="20" actrange="-9 9"')
+    assert errors_of_a_perfect_model(tmp_path, mjcf_of_velocity, ctrl).max() < 1e-4
+
+
+def test_a_filter_beside_a_gear_that_bends_follows_its_commands(tmp_path):
+    joints = [f'<joint name="{name}" axis="0 1 0" damping=".3" armature=".02"/>' for name in "ab"]
+    geom = '<geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1" contype="0"/>'
+    bodies = "".join(f"<body>{joint}{geom}</body>" for joint in joints)
+    motors = (
+        '<motor joint="a" name="a"/>'
+        '<general joint="b" name="b" dyntype="filterexact" dynprm=".2" gainprm="1"/>'
+    )
+    apart = (
+        '<mujoco><option timestep="0.005" gravity="0 0 0"/>'
+        f"<worldbody>{bodies}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+    time = np.arange(600) * 0.01
+    ctrl = np.stack([0.3 * np.sin(3 * time), 0.8 * np.sign(np.sin(2.3 * time + 1))], axis=1)
+    stiff = JointFlexibility("joint/a", stiffness=5000.0, damping=1.0)
+    assert errors_of_a_perfect_model(tmp_path, apart, ctrl, stiff).max() < 1e-3
+
+
 def test_spans_begin_where_activations_are_known():
     made, _ = record("filter", 0, 2.0)
     split = dataclasses.replace(made, spans=((0, 100), (100, 200), (250, 500)))
     assert known_spans(split, 0.6) == ((150, 200), (250, 500))
     assert known_spans(split, 0.0) == split.spans
+
+
+@pytest.mark.parametrize("after", [301, 302])
+def test_too_few_samples_before_a_gap_tell_no_torque(after):
+    model = mujoco.MjModel.from_xml_string(mjcf("filter"))
+    made, _ = record("filter", 0, 4.0)
+    split = dataclasses.replace(made, spans=((0, after), (after, len(made.time))))
+    assert len(missing_torque(model, [split]).torque) > 600
 
 
 def test_a_muscle_forgets_as_slowly_as_it_lets_go():
