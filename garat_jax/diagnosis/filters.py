@@ -126,8 +126,17 @@ def quantum(values: np.ndarray) -> float:
     """Return the step of a quantised signal [T], 0 where the values lie on no grid.
 
     Where most values differ, as in a fast motion, steps between some may be missing. Two levels are
-    a grid only if the signal goes back and forth between them.
+    a grid only if the signal goes back and forth between them. A steady motion has equal steps
+    too, but only what lies on a grid bends by its steps.
     """
+    step = _spacing(values)
+    bends = np.abs(np.diff(values, 2))
+    bends = bends[bends > 1e-6 * step]
+    return step if len(bends) and float(np.median(bends)) > 0.5 * step else 0.0
+
+
+def _spacing(values: np.ndarray) -> float:
+    """Return the step that all values [T] are apart by, a whole number of times; 0 if none is."""
     levels = np.unique(values)
     if len(levels) < 2 or np.count_nonzero(np.diff(values)) < TOGGLES:
         return 0.0

@@ -185,7 +185,7 @@ class Problem(Generic[AnySimulator]):
         """Return each whitened residual's block of time within its segment, [S, N]."""
         num_samples, num_signals = self.segments.measured.shape[1:]
         count = max(1, num_samples // max(1, round(BLOCK / self.interval)))
-        place = self.segments.place
+        place = self.segments.place * (self.segments.weight > 0)  # none of padding alone
         block = np.floor(place * count / (np.floor(place.max()) + 1.0)).astype(int)
         return np.repeat(np.minimum(block, count - 1), num_signals, axis=1)
 

@@ -5,15 +5,16 @@ positions are no measurements: they say nothing that the positions do not, so th
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from scipy import integrate, optimize
 
 from garat_jax.diagnosis.activation import check_known, forgets_in, known_spans
 from garat_jax.diagnosis.filters import UNIFORM
-from garat_jax.diagnosis.measurements import Recording, noise
+from garat_jax.diagnosis.measurements import Recording, find_gaps
+from garat_jax.diagnosis.noise import noise_of
 from garat_jax.errors import UserError
 
 WARM_UP = 0.5
@@ -29,18 +30,10 @@ SLIP = 0.05
 `FOLLOWED` seconds."""
 FOLLOWED = 2.0
 """Seconds of the longest segments."""
-SMALLEST_NOISE = 1e-4
-"""Noise assumed at least, relative to the signal's standard deviation."""
-UNKNOWN_NOISE = 1e-6
-"""Noise assumed where no signal of a kind ever changes, in the signals' units."""
 QUIET = 10.0
 """Multiple of its noise that a signal's spread counts as at least where a horizon is chosen; one
 that spreads less hardly moves: it is predicted no better than its noise, which is no error of the
 model."""
-KINEMATIC_WINDOWS = np.asarray([0.04, 0.06, 0.09, 0.13, 0.2, 0.3])
-"""Seconds over which position and velocity sensors are held against each other."""
-HELD_AGAINST = 0.05
-"""Seconds over which the velocities' error is averaged, of what grows with time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,7 +194,6 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     """
     samples = [grid.interval if grid.uniform else r.interval for r in recordings]
     lengths = [max(SHORTEST, round(horizon / sample)) for sample in samples]
-    with_velocity = [r for r in recordings if r.velocity_measured]
     pieces = [
         (index, start, min(start + length, stop))
         for index, (r, length) in enumerate(zip(recordings, lengths, strict=True))
@@ -220,20 +212,14 @@ def cut(recordings: Sequence[Recording], grid: Grid, horizon: float) -> Segments
     ]
     measured, weight, start, ctrl, place = (np.stack(parts) for parts in zip(*rows, strict=True))
     num_position = recordings[0].qpos.shape[1]
-    num_signals = measured.shape[2] if with_velocity else num_position
-    deviations = np.sqrt(np.mean([signal_noise(r) ** 2 for r in recordings], axis=0))
-    if with_velocity:
-        of_velocity = np.mean([signal_noise(r) ** 2 for r in with_velocity], axis=0)
-        deviations[num_position:] = np.sqrt(of_velocity)[num_position:]
+    has_velocity = any(r.velocity_measured for r in recordings)
+    num_signals = measured.shape[2] if has_velocity else num_position
     measured = measured[..., :num_signals]
     spread = measured[weight > 0].std(axis=0)
-    deviations = np.maximum(deviations[:num_signals], SMALLEST_NOISE * spread)
+    deviations = noise_of(recordings, measured, weight)
     index = np.asarray([i for i, _, _ in pieces])
     observed = np.ones((len(pieces), num_signals), bool)
     observed[:, num_position:] = np.asarray([r.velocity_measured for r in recordings])[index, None]
-    is_still = np.ptp(measured[weight > 0], axis=0) == 0
-    for kind in (slice(num_position), slice(num_position, num_signals)):
-        deviations[kind] = _noise_of_still(deviations[kind], is_still[kind])
     return Segments(
         measured=measured,
         weight=weight,
@@ -279,62 +265,9 @@ def _unit(start: np.ndarray) -> np.ndarray:
     return np.maximum(spread, 1e-3 * max(float(spread.max()), 1e-3))
 
 
-def _noise_of_still(noise: np.ndarray, is_still: np.ndarray) -> np.ndarray:
-    """Give signals that never change, whose encoders hide their noise, the most of their kind."""
-    most = noise[~is_still].max(initial=0.0) or UNKNOWN_NOISE
-    return np.where(is_still, most, noise)
-
-
 def warm_up_steps(grid: Grid, num_actuators: int) -> int:
     """Return the steps before each segment; without actuators nothing has to fill."""
     return int(np.ceil(max(WARM_UP, grid.forgets) / grid.interval)) if num_actuators else 0
-
-
-def signal_noise(recording: Recording) -> np.ndarray:
-    """Estimate each signal's error, [nq + nv], also where it is not white.
-
-    Noise that changes slowly from sample to sample hides from `noise`, as do filtered velocities,
-    but position and velocity sensors then contradict each other. How far the change of a position
-    is from the integral of its velocity depends on the time in between: what does not grow with it
-    is the positions' error, what grows is the velocities'. (Joints of one dof alone; a quaternion
-    is no integral.)
-    """
-    white = np.asarray(noise(recording))
-    num = recording.qpos.shape[1]
-    if not recording.velocity_measured or num != recording.qvel.shape[1]:
-        return white
-    interval = recording.interval
-    longest = max(b - a for a, b in recording.spans)
-    windows = np.unique(np.maximum(2, np.round(KINEMATIC_WINDOWS / interval).astype(int)))
-    windows = windows[windows < longest]
-    if len(windows) < 3:
-        return white
-    apart = _contradictions(recording, windows)
-    seconds = windows * interval
-    powers = np.stack([np.ones_like(seconds), seconds, seconds**2], axis=1)
-    error = white.copy()
-    for joint in range(num):
-        scale = np.maximum(apart[:, joint], 1e-300)
-        constant, walk, drift = optimize.nnls(powers / scale[:, None], np.ones(len(scale)))[0]
-        moving = walk / HELD_AGAINST + drift - white[num + joint] ** 2 * interval / HELD_AGAINST
-        error[joint] = max(white[joint], np.sqrt(constant / 2))
-        error[num + joint] = np.hypot(white[num + joint], np.sqrt(max(moving, 0.0)))
-    return error
-
-
-def _contradictions(recording: Recording, windows: np.ndarray) -> np.ndarray:
-    """Return the mean square of change of position less integrated velocity, [windows, nv]."""
-    apart = []
-    for a, b in recording.spans:
-        time, speed = recording.time[a:b], recording.qvel[a:b]
-        travelled = integrate.cumulative_trapezoid(speed, time, axis=0, initial=0.0)
-        apart.append(recording.qpos[a:b] - travelled)
-    return np.stack(
-        [
-            np.mean(np.concatenate([d[size:] - d[:-size] for d in apart]) ** 2, axis=0)
-            for size in windows
-        ]
-    )
 
 
 def _past_steps(recording: Recording, grid: Grid) -> np.ndarray:
@@ -354,7 +287,8 @@ def _past_qvel(recordings: Sequence[Recording], steps: Sequence[np.ndarray]) -> 
     """Return every recording's velocity in the middle of the simulated steps, [R, T, nv]."""
     qvel = np.zeros((len(recordings), max(at[-1] for at in steps), recordings[0].qvel.shape[1]))
     for row, recording, at in zip(qvel, recordings, steps, strict=True):
-        for a, b in recording.spans:
+        borders = [0, *(find_gaps(recording.time) + 1), len(recording.time)]
+        for a, b in itertools.pairwise(borders):  # also where it is left out or held out
             every = np.arange(at[a], at[b - 1])
             speeds = [np.interp(every + 0.5, at[a:b], v) for v in recording.qvel[a:b].T]
             row[every] = np.stack(speeds, axis=1)

@@ -13,9 +13,10 @@ from garat_jax.diagnosis.fit import are_determined, fit, interval, promises_more
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.noise import signal_noise
 from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels
 from garat_jax.diagnosis.screen import cosine, screen
-from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, metric_spread, signal_noise
+from garat_jax.diagnosis.segments import QUIET, choose_grid, cut, metric_spread
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import follow, settle
 from garat_jax.diagnosis.timestep import count_timestep

@@ -7,10 +7,11 @@ import pytest
 
 from garat_jax.diagnosis.compare import compare
 from garat_jax.diagnosis.metric import make_metric
+from garat_jax.diagnosis.noise import signal_noise
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.replay import as_recordings, replay
 from garat_jax.diagnosis.report import traces
-from garat_jax.diagnosis.segments import choose_grid, cut, signal_noise
+from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.velocity import estimate_velocity
 from garat_jax.diagnosis.view import look
 from tests.diagnosis.pendulum import MODEL, add_damping, record

@@ -127,5 +127,15 @@ def test_an_encoder_has_noise_where_it_rests_and_where_it_runs(speed):
     assert quantum(rng.normal(size=1500)) == 0.0
 
 
+@pytest.mark.parametrize("bits", [11, 14])
+def test_a_steady_run_is_no_coarse_encoder(bits):
+    time, step = 0.01 * np.arange(800), 2 * np.pi / 2**bits
+    for angle in (5 * time, 5 * time + 0.008 * np.sin(6 * time)):
+        assert quantum(np.round(angle / step) * step) <= 1.01 * step
+        noisy = angle + 1e-4 * np.random.default_rng(0).normal(size=800)
+        assert white_noise(time, noisy[:, None])[0] == pytest.approx(1e-4, rel=0.3)
+    assert quantum(np.round(0.05 * time / step) * step) == pytest.approx(step)
+
+
 def test_torque_per_command_is_gear_and_gain():
     np.testing.assert_allclose(torque_per_command(ARM), [[60.0, 0.0], [0.0, 2.0]], atol=1e-6)

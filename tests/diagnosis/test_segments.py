@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis.diagnose import diagnose
+from garat_jax.diagnosis.diagnose import diagnose, split
 from garat_jax.diagnosis.findings import Named
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.problem import Problem, block_labels
 from garat_jax.diagnosis.segments import WARM_UP, choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.errors import UserError
@@ -125,3 +125,40 @@ def test_segments_of_a_slow_recording_do_not_make_rests_of_the_others():
     segments = cut(made, choose_grid(made, TIMESTEP), 0.2)
     assert np.all(segments.is_whole)
     assert segments.weight.sum(axis=1)[-1] == 10.0
+
+
+def test_padding_is_no_block_of_time():
+    made = [sampled(np.arange(800) / 100), sampled(np.arange(25) / 100)]
+    grid = choose_grid(made, TIMESTEP)
+    segments = cut(made, grid, 2.0)
+    problem = Problem(Simulator(MODEL, (), grid), segments, segments.recording == 0, grid.sample)
+    assert len(np.unique(block_labels(problem)[~problem.fitted])) == 1
+
+
+def test_the_motion_before_what_is_held_out_stays_known():
+    whole = sampled(np.arange(900) / 100)
+    grid = choose_grid([whole], TIMESTEP)
+    (_,), (last,), _ = split([whole], ())
+    segments, past = (cut([r], grid, 0.5).past_qvel for r in (last, whole))
+    np.testing.assert_array_equal(segments, past)
+    assert np.count_nonzero(past) > 890
+
+
+def test_a_wheel_that_rolls_on_has_the_noise_of_its_encoder():
+    rng, time = np.random.default_rng(0), np.arange(800) / 100
+
+    def rolls(speed):
+        speeds = speed + 2 * np.sin(3 * time)
+        state = np.stack([np.cumsum(speeds) / 100, speeds], axis=1)
+        state += rng.normal(size=(800, 2)) * [1e-3, 1e-2]
+        return dataclasses.replace(sampled(time), qpos=state[:, :1], qvel=state[:, 1:])
+
+    made = [rolls(speed) for speed in (100.0, -100.0, 100.0)]
+    noise = cut(made, choose_grid(made, TIMESTEP), 0.2).noise
+    assert noise[0] == pytest.approx(1e-3, rel=0.3)
+
+
+def test_a_joint_that_stands_elsewhere_in_each_recording_has_some_noise():
+    made, nothing = sampled(np.arange(800) / 100), np.zeros((800, 1))
+    still = [dataclasses.replace(made, qpos=nothing + k, qvel=nothing) for k in range(2)]
+    assert np.all(cut(still, choose_grid(still, TIMESTEP), 0.5).noise > 0)
