@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 
 from garat_jax.effects.base import Effect, ModelView, parameter
-from garat_jax.effects.elements import element_id
+from garat_jax.effects.elements import element_id, free_name
 
 FLAT = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
 """Geoms that cannot touch each other."""
@@ -80,13 +80,12 @@ class ContactEffect(Effect):
 
     def prepare(self, spec: mujoco.MjSpec) -> None:
         """Name every pair that the geom can form, with the numbers that the compiler gives it."""
-        copy = spec.copy()
-        host = copy.compile()
-        geoms = {compiled.id: geom for geom, compiled in zip(spec.geoms, copy.geoms, strict=True)}
+        host, geoms = _compile_named(spec)
         index = element_id(host, "geom", self.name)
         for other in partners(host, index):
-            geoms[other].name = geoms[other].name or f"{NAMELESS}{other}"
-            pair = spec.add_pair(geomname1=self.name, geomname2=geoms[other].name)
+            name = host.geom(other).name
+            geoms[name].name = name
+            pair = spec.add_pair(geomname1=self.name, geomname2=name)
             deciding = _deciding(host, index, other)
             pair.condim = int(host.geom_condim[deciding].max())
             pair.adhesion = float(host.geom_adhesion[deciding].sum())
@@ -214,6 +213,18 @@ def partners(host: mujoco.MjModel, geom: int) -> list[int]:
         for other in range(host.ngeom)
         if other not in listed and _can_touch(host, geom, other)
     ]
+
+
+def _compile_named(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, dict[str, mujoco.MjsGeom]]:
+    """Compile a copy whose geoms all have names, and return each geom of the spec by its name.
+
+    The compiler may put geoms in another order (fusestatic) and leave some out (discardvisual).
+    """
+    copy, geoms = spec.copy(), {}
+    for index, (geom, named) in enumerate(zip(spec.geoms, copy.geoms, strict=True)):
+        named.name = geom.name or free_name(f"{NAMELESS}{index}", copy.geom)
+        geoms[named.name] = geom
+    return copy.compile(), geoms
 
 
 def _are_off(host: mujoco.MjModel) -> bool:

@@ -78,6 +78,45 @@ def test_a_named_contact_has_the_numbers_of_an_unnamed_one():
         np.testing.assert_allclose(*(getattr(c, name) for c in contacts), err_msg=name)
 
 
+FUSED = """
+<mujoco><compiler fusestatic="%s"/><worldbody><geom name="floor" type="plane" size="1 1 0.1"/>
+  <body pos="0 0 1"><freejoint/><geom name="trunk" size="0.1"/>
+    <body pos="0 0 -0.2"><geom name="pad" size="0.05"/></body>
+    <body pos="0 0 -0.1"><joint/><geom name="foot" size="0.04" pos="0 0 -0.2"/></body></body>
+  <body pos="1 0 0"><geom name="wall" type="box" size="0.1 0.1 1" friction="0.2"/></body>
+  <body pos="0 2 1"><freejoint/><geom size="0.1" friction="2"/></body></worldbody></mujoco>
+"""
+
+
+@pytest.mark.parametrize("fuses", ["false", "true"])
+def test_the_geoms_of_bodies_that_are_fused_are_not_mistaken_for_others(fuses):
+    effect = ContactFriction("geom/foot", sliding=1.0)
+    host = dynamics.compile(spec(FUSED % fuses), effects=(effect,), engine="mujoco").host.model
+    exported = spec(FUSED % fuses)
+    effect.export(exported)
+    plain = exported.compile()
+    for model, stone in ((host, 2.0), (plain, 1.0)):
+        pairs = zip(model.pair_geom1, model.pair_geom2, model.pair_friction[:, 0], strict=True)
+        found = {frozenset(model.geom(g).name for g in (a, b)): mu for a, b, mu in pairs}
+        assert found == {
+            frozenset({"foot", "floor"}): stone / 2,
+            frozenset({"foot", "wall"}): stone / 2,
+            frozenset({"foot", "nameless geom 5"}): stone,
+        }
+
+
+def test_geoms_that_the_compiler_discards_make_no_pairs():
+    shell = '<geom type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0" mass="0"/>'
+    seen = PAIRED.replace("<freejoint/>", f"<freejoint/>{shell}")
+    seen = seen.replace("<worldbody>", '<compiler discardvisual="true"/><worldbody>')
+    effect = ContactFriction("geom/ball", sliding=0.6)
+    exported = spec(seen)
+    effect.export(exported)
+    host = dynamics.compile(spec(seen), effects=(effect,), engine="mujoco").host.model
+    for model in (host, exported.compile()):
+        assert (model.ngeom, model.npair) == (5, 3)
+
+
 def stopping(sliding: float, engine: str, geoms=("ball",)) -> float:
     """Return how far a puck at 1 m/s slides in 0.1 s."""
     effects = tuple(ContactFriction(f"geom/{name}", sliding=sliding) for name in geoms)
