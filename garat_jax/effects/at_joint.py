@@ -141,7 +141,7 @@ def drive(
             force = force + (gain[1] * length + gain[2] * velocity) * command
         if host.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE:
             force = force + bias[0] + bias[1] * length + bias[2] * velocity
-        own = jnp.asarray(_pull(host, i), ctrl.dtype)
+        own = _pull(model, i).astype(ctrl.dtype)
         if host.actuator_forcelimited[i]:
             low, high = model["actuator_forcerange"][i]
             own = jnp.where((low < force) & (force < high), own, 0.0)
@@ -154,11 +154,11 @@ def drive(
     return Drive(total.astype(ctrl.dtype), *jnp.maximum(pull, 0.0))
 
 
-def feedback(host: mujoco.MjModel, joint: int) -> tuple[float, float]:
+def feedback(model: ModelView, joint: int) -> tuple[jax.Array, jax.Array]:
     """Return how much a joint's servos pull back per angle and per speed, N m/rad, N m s/rad."""
-    pull = sum((_pull(host, i) for i in drivers(host, joint)), np.zeros(2))
-    per_angle, per_speed = np.maximum(pull, 0.0)
-    return float(per_angle), float(per_speed)
+    pull = sum((_pull(model, i) for i in drivers(model.host, joint)), jnp.zeros(2))
+    per_angle, per_speed = jnp.maximum(pull, 0.0)
+    return per_angle, per_speed
 
 
 def has_limit(host: mujoco.MjModel, joint: int) -> bool:
@@ -167,8 +167,9 @@ def has_limit(host: mujoco.MjModel, joint: int) -> bool:
     return bool(np.any(limited) or host.jnt_actfrclimited[joint])
 
 
-def _pull(host: mujoco.MjModel, actuator: int) -> np.ndarray:
+def _pull(model: ModelView, actuator: int) -> jax.Array:
     """Return how much an actuator pulls back per angle and per speed of its joint, [2]."""
-    if host.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE:
-        return np.zeros(2)
-    return -host.actuator_biasprm[actuator, 1:3] * host.actuator_gear[actuator, 0] ** 2
+    if model.host.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE:
+        return jnp.zeros(2)
+    gear = float(model.host.actuator_gear[actuator, 0])
+    return -model["actuator_biasprm"][actuator, 1:3] * gear**2

@@ -154,7 +154,7 @@ class Transmission(Effect, abc.ABC):
         host = model.host
         dof = host.joint(self.name).dofadr[0]
         gone = jnp.where(self.active, self.inertia(host), 0.0)
-        pull = feedback(host, element_id(host, "joint", self.name))
+        pull = feedback(model, element_id(host, "joint", self.name))
         damping = self._damping(host, pull, pull[1])
         return {
             "dof_armature": model["dof_armature"].at[dof].add(-gone),
@@ -167,7 +167,7 @@ class Transmission(Effect, abc.ABC):
         if not (self.minds_limits and has_limit(host, joint)):
             return {}
         place = self._place(host, state, state.memory)
-        pull = feedback(host, joint)
+        pull = feedback(model, joint)
         motor, native = self._drives(model, place, ctrl)
         change = self._damping(host, motor[1:], native.per_speed)
         change = change - self._damping(host, pull, pull[1])
@@ -219,11 +219,11 @@ class Transmission(Effect, abc.ABC):
 
         MJX takes their feedback implicitly at their limits, too.
         """
-        host, joint = model.host, element_id(model.host, "joint", self.name)
+        joint = element_id(model.host, "joint", self.name)
         angle, speed = place.angle + place.deflection, place.speed + place.slip
         motor = drive(model, joint, angle, speed, ctrl)
         native = drive(model, joint, place.angle, place.speed, ctrl)
-        pull = tuple(jnp.asarray(value, ctrl.dtype) for value in feedback(host, joint))
+        pull = tuple(value.astype(ctrl.dtype) for value in feedback(model, joint))
         if not self.minds_limits:
             motor = Drive(motor.torque, *pull)
         if not self.minds_limits or model.engine == "mjx":
@@ -265,11 +265,11 @@ class Transmission(Effect, abc.ABC):
             f"{self.kind} at {self.target} as a force; instead {motor} is a body with the motor's "
             f"inertia and actuators, and the tendon {gear.name} {how}"
         )
+        model = ModelView(host, lambda name: jnp.asarray(getattr(host, name)))
+        pull = feedback(model, element_id(host, "joint", self.name))
         per_angle, per_speed = (
-            rate + servo / self.inertia(host)
-            for rate, servo in zip(
-                self.rates(host), feedback(host, element_id(host, "joint", self.name)), strict=True
-            )
+            rate + float(servo) / self.inertia(host)
+            for rate, servo in zip(self.rates(host), pull, strict=True)
         )
         limit = STABLE / (per_speed + np.sqrt(per_speed**2 + STABLE * per_angle) + 1e-12)
         if spec.option.timestep > (longest := MARGIN * limit):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from garat_jax import dynamics
-from garat_jax.effects import Backlash, JointFlexibility
+from garat_jax.effects import BackEmf, Backlash, JointFlexibility, MotorGain
 from garat_jax.errors import UserError
 from tests.effects.truth import RIG, SERVO, Truth, commands, predict, record, recover
 from tests.models import PENDULUM, spec
@@ -102,6 +102,43 @@ def test_a_servo_at_the_limit_of_its_force_pulls_back_no_more(effect, gear, limi
     ctrl = commands(1.0)
     error = (predict(mjcf, (effect,), ctrl) - record(two, Truth(), ctrl))[:, 0]
     assert np.sqrt(np.mean(error**2)) < 5e-3
+
+
+APART = {
+    "bends": JointFlexibility("joint/hinge", stiffness=50.0, damping=0.02),
+    "has play": Backlash("joint/hinge", gap=0.02),
+}
+ALTERED = {
+    "back-EMF": (BackEmf("actuator/motor", coefficient=2.0), 'kp="20" kv="3"'),
+    "gain": (MotorGain("actuator/motor", scale=2.5), 'kp="50" kv="2.5"'),
+}
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("what", APART)
+@pytest.mark.parametrize("altered", ALTERED)
+def test_a_motor_apart_is_the_one_that_other_effects_leave(altered, what, integrator):
+    effect, servo = ALTERED[altered]
+    mjcf = UNDAMPED["servo"].replace("/>", f' integrator="{integrator}"/>', 1)
+    found = predict(mjcf, (APART[what], effect), commands(0.5))
+    mjcf = mjcf.replace('kp="20" kv="1"', servo)
+    np.testing.assert_allclose(found, predict(mjcf, (APART[what],), commands(0.5)), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("what", "gear", "error"),
+    [("bends", GEAR.format(50.0, 0.02), 5e-3), ("has play", play(0.02), 0.05)],
+)
+def test_a_light_motor_with_back_emf_moves_as_at_a_fine_timestep(what, gear, error):
+    """The contact of so light a motor yields by 32 mrad under 1 N m."""
+    ctrl = commands(1.0)
+    light = 'armature="0.0005"'
+    two = TWO_BODIES.replace('armature="0.01"', light)
+    braked = '<general joint="rotor" gear="2" biastype="affine" biasprm="0 0 -0.25"/>'
+    true = record(two.format(gear=gear, actuator=braked), Truth(), ctrl)
+    mjcf = UNDAMPED["motor"].replace('armature="0.01"', light)
+    found = predict(mjcf, (BackEmf("actuator/motor", coefficient=1.0), APART[what]), ctrl)
+    assert np.sqrt(np.mean((found - true)[:, 0] ** 2)) < error
 
 
 @pytest.mark.parametrize("start", [start["gap"] for start in Backlash.starts(HOST, "joint/hinge")])
