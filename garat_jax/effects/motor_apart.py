@@ -105,7 +105,8 @@ class Transmission(Effect, abc.ABC):
     elements: ClassVar[tuple[str, ...]] = ("joint",)
     needs: ClassVar[str] = (
         "a joint with motors or servos without dynamics, armature or damping of their own, an "
-        "armature above 0 of the joint (the motor's inertia), and an integrator other than RK4"
+        "armature above 0 of the joint (the motor's inertia), an integrator other than RK4, and "
+        "no flag that disables damper"
     )
     acts: ClassVar[bool] = True
     reads_state: ClassVar[bool] = True
@@ -124,7 +125,8 @@ class Transmission(Effect, abc.ABC):
         if any(np.any(values) for values in own):
             return False
         moving = host.dof_armature[host.joint(name).dofadr[0]] > 0
-        return bool(moving) and host.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
+        damps = not host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_DAMPER
+        return bool(moving) and damps and host.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
 
     def excludes(self, other: Effect) -> bool:
         """Say whether both are between one motor and its joint: each takes the motor off."""

@@ -40,6 +40,7 @@ class JointFlexibility(Transmission):
     kind: ClassVar[str] = "joint_flexibility"
     law: ClassVar[str] = "τ = k·(θ_m − q) + d·(θ̇_m − q̇), J·θ̈_m = τ_a − τ"
     identified_by: ClassVar[str] = "steps and chirps through the resonance; a load against a servo"
+    needs: ClassVar[str] = f"{Transmission.needs}, nor under Euler eulerdamp"
 
     stiffness: jax.Array = parameter(
         RIGID,
@@ -57,6 +58,13 @@ class JointFlexibility(Transmission):
         scale=1e-2,
         source="As viscous_damping; gears lose a few per cent of critical damping",
     )
+
+    @classmethod
+    def fits(cls, host: mujoco.MjModel, element: str, name: str) -> bool:
+        """Say whether the joint has such a motor, and the engine takes its damping implicitly."""
+        is_euler = host.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        is_off = bool(host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        return super().fits(host, element, name) and not (is_euler and is_off)
 
     @classmethod
     def starts(cls, host: mujoco.MjModel, target: str) -> tuple[Mapping[str, float], ...]:

@@ -264,6 +264,7 @@ IMPOSSIBLE = {
     "RK4": RIG.replace("/>", ' integrator="RK4"/>', 1),
     "armature of an actuator": RIG.replace('gear="2"', 'gear="2" armature="0.1"'),
     "damping of an actuator": RIG.replace('gear="2"', 'gear="2" damping="0.1"'),
+    "no dampers": RIG.replace("/>", '><flag damper="disable"/></option>', 1),
 }
 
 
@@ -272,3 +273,16 @@ def test_a_joint_without_a_motor_that_can_turn_is_refused(mjcf):
     with pytest.raises(UserError, match=r"armature above 0.*other than RK4"):
         dynamics.compile(spec(mjcf), effects=(Backlash("joint/hinge", gap=0.1),))
     assert Backlash.targets(spec(mjcf).compile()) == []
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_a_gear_that_bends_needs_damping_that_is_implicit(integrator):
+    option = f' integrator="{integrator}"><flag eulerdamp="disable"/></option>'
+    model = spec(RIG.replace("/>", option, 1))
+    is_euler = integrator == "Euler"
+    host = model.compile()
+    assert JointFlexibility.targets(host) == ([] if is_euler else ["joint/hinge"])
+    assert Backlash.targets(host) == ["joint/hinge"]
+    if is_euler:
+        with pytest.raises(UserError, match="disables damper, nor under Euler eulerdamp"):
+            JointFlexibility("joint/hinge").check(host)
