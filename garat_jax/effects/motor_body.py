@@ -45,8 +45,11 @@ def add_motor(spec: mujoco.MjSpec, host: mujoco.MjModel, name: str, inertia: flo
         setattr(apart, unset, 0.0 * np.asarray(getattr(apart, unset)))
     joint.armature -= inertia
     joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    for actuator in drivers(host, index):
-        spec.actuators[actuator].target = motor
+    for number in drivers(host, index):
+        actuator = spec.actuators[number]
+        actuator.target = motor
+        if actuator.inheritrange:  # the motor's joint has no range
+            actuator.ctrlrange, actuator.inheritrange = host.actuator_ctrlrange[number], 0.0
     _add_to_keys(spec, name, motor)
     return motor
 

@@ -220,6 +220,19 @@ def test_an_export_needs_a_fine_timestep_where_the_gear_is_stiff():
         assert (farthest < 0.05) == is_stable
 
 
+@pytest.mark.parametrize("effect", EXPORTED.values(), ids=EXPORTED)
+def test_an_exported_servo_keeps_the_range_that_it_inherits(effect):
+    ranged = SERVO.replace('name="hinge"', 'name="hinge" range="-90 45"')
+    exported = spec(ranged.replace('ctrlrange="-3 3"', 'inheritrange="0.8"'))
+    expected = exported.copy().compile().actuator("motor").ctrlrange
+    effect.export(exported)
+    exported.compile()
+    model = mujoco.MjModel.from_xml_string(exported.to_xml())
+    assert model.actuator("motor").ctrllimited[0]
+    np.testing.assert_allclose(model.actuator("motor").ctrlrange, expected, rtol=1e-5)
+    np.testing.assert_allclose(expected, np.radians([-76.5, 31.5]))
+
+
 def test_a_rigid_motor_is_not_exported():
     for rigid in (JointFlexibility("joint/hinge"), Backlash("joint/hinge")):
         exported = spec(RIG)
