@@ -121,7 +121,7 @@ def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:
     """Scale a body's inertial and its geoms: the compiler decides which of them counts."""
     if mass <= 0:
         raise UserError(f"body/{body.name} mass must be positive, not {mass:g} kg")
-    before = float(compiled(spec).body(body.name).mass[0])
+    before = _mass(spec, body.name)
     if not before:
         raise UserError(
             f"body/{body.name} has no mass to scale; name a body that moves, with an inertial or "
@@ -136,12 +136,19 @@ def _scale_mass(spec: mujoco.MjSpec, body, mass: float) -> None:
             geom.mass = geom.mass * ratio
         else:
             geom.density = geom.density * ratio
-    after = float(compiled(spec).body(body.name).mass[0])
+    after = _mass(spec, body.name)
     if abs(after - mass) > 1e-6 * mass:
         raise UserError(
             f"body/{body.name} mass is {after:g} kg whatever is asked for: "
             "settotalmass or boundmass of the model's compiler overrules it"
         )
+
+
+def _mass(spec: mujoco.MjSpec, body: str) -> float:
+    """Return a body's compiled mass, kg: its own, also where fusestatic joins it with others."""
+    apart = spec.copy()
+    apart.compiler.fusestatic = False
+    return float(compiled(apart).body(body).mass[0])
 
 
 def compiled(spec: mujoco.MjSpec) -> mujoco.MjModel:

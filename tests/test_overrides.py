@@ -22,6 +22,21 @@ def test_a_mass_override_scales_the_inertia_with_it():
     np.testing.assert_allclose(after.body("pole").inertia, 3 * before.body("pole").inertia)
 
 
+@pytest.mark.parametrize("name", ["pole", "tip"])
+def test_a_mass_override_is_that_of_the_named_body_where_bodies_are_fused(name):
+    tip = '<body name="tip" pos="0 0 -0.5"><geom size="0.05" mass="0.4"/></body></body></worldbody>'
+    fused, apart = (spec(PENDULUM.replace("</body></worldbody>", tip)) for _ in range(2))
+    fused.compiler.fusestatic = True
+    override = (Override("body", name, "mass", 1.8),)
+    model, whole = (
+        dynamics.compile(each, override, engine="mujoco").host.model for each in (fused, apart)
+    )
+    assert model.nbody == 2
+    np.testing.assert_allclose(whole.body(name).mass, 1.8)
+    np.testing.assert_allclose(model.body("pole").mass, whole.body_mass.sum())
+    np.testing.assert_allclose(model.dof_M0, whole.dof_M0)
+
+
 def test_options_that_are_words_in_mjcf_take_the_word_or_the_number():
     for value in ("RK4", 1):
         model = compiled(Override("option", "", "integrator", value))
