@@ -245,8 +245,8 @@ class AirDrag(Effect):
 
 
 def moves(host: mujoco.MjModel, body: str) -> bool:
-    """Say whether joints let a body move."""
-    return bool(host.body(body).weldid[0] > 0)
+    """Say whether joints move a body, or what it is fixed to: not one that mocap leads."""
+    return bool(host.body_dofnum[host.body(body).weldid[0]] > 0)
 
 
 def write_inertials(spec: mujoco.MjSpec, name: str = "") -> None:

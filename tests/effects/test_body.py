@@ -117,6 +117,18 @@ def test_a_com_offset_is_an_inertial_that_lies_elsewhere(engine):
     np.testing.assert_allclose(found.qvel, expected.qvel, rtol=1e-4, atol=1e-4)
 
 
+def test_a_mocap_body_does_not_move_by_itself():
+    host = spec("""
+    <mujoco><worldbody><body name="wall"><geom size="0.1"/></body>
+      <body name="guide" mocap="true"><geom size="0.1"/>
+        <body name="mount"><geom size="0.1"/></body>
+        <body name="arm"><joint/><geom size="0.1"/>
+          <body name="hand"><geom size="0.1"/></body></body></body></worldbody></mujoco>
+    """).compile()
+    for kind in (PayloadMass, ComOffset, AirDrag):
+        assert kind.targets(host) == ["body/arm", "body/hand"]
+
+
 @pytest.mark.parametrize("options", ["", 'inertiafromgeom="true"'])
 def test_a_mass_override_reaches_a_body_with_both_inertial_and_geoms(options):
     model = spec(LOOSE % options)
