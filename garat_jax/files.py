@@ -31,7 +31,7 @@ def write_whole(path: Path, text: str) -> Path:
 def distinct_names(paths: Collection[Path]) -> dict[Path, str]:
     """Name files by the last parts of their paths, as many of them as tell all files apart."""
     names: dict[Path, str] = {}
-    whole = {path: path.absolute() for path in paths}
+    whole = {path: Path(path).absolute() for path in paths}
     longest = max((len(path.parts) for path in whole.values()), default=1)
     for num in range(1, longest + 1):
         names = {path: Path(*w.parts[-num:]).as_posix() for path, w in whole.items()}
