@@ -48,7 +48,8 @@ class Model:
         transform: A learned action transformer, (qpos and qvel as the sensors report them
             [nq + nv], command [nu]) -> command sent instead. Predictions and `world` have it,
             `compile` does not.
-        interval: Seconds of the control steps that it was learned on; None without it.
+        interval: Seconds of the control steps that it was learned on, for which predictions hold
+            what it sends; None without it.
     """
 
     name: str

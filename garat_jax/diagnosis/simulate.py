@@ -98,6 +98,8 @@ class Simulator:
         self._memoryless = tuple(i for i in looking if self._is_memoryless(replayed[i]))
         self._plain = tuple(i for i in self._blind if self._is_memoryless(replayed[i]))
         self._transform = model.transform
+        lasts = model.interval if model.transform else None
+        self._num_held = max(1, round((lasts or 0.0) / grid.interval))
         self._follower = Follower(self.host, grid.interval)
         self._any_at_once = dynamics.steps_at_once(self._alone) and model.transform is None
         self._jitted = functools.lru_cache(NUM_PROGRAMS if refine <= 2 else NUM_FINER)(self._jit)
@@ -316,11 +318,17 @@ class Simulator:
 
         During the warm-up it is held at its start. Motors behind gears that bend swing for longer
         than a segment: with a memory of the motion it is then led along the measured one.
+
+        An action transformer acts as it was learned: once in about `Model.interval`, counted from
+        the segment's start, on the mean of the commands until it acts again, and what it sends is
+        held.
         """
         world = self._with(world, chosen, theta)
         leads = has_memory_of_motion(world.effects, self.host)
         num_before = self._warm_up + (lead_steps(self._grid) if leads else 0)
         state = self._begin(world, start, past, num_before)
+        if self._num_held > 1:
+            ctrl = self._held_means(ctrl)
 
         def whole(state):
             return jnp.concatenate([state.qpos, state.qvel])
@@ -345,9 +353,12 @@ class Simulator:
             led = dynamics.lead(world, state, commanded(state, command), *path)
             return since_begun(has_begun, led, state), None
 
-        def advance(state, command):
-            state = dynamics.step(world, state, commanded(state, command), self._substeps)
-            return state, (whole(dynamics.sensed(world, state)), whole(state))
+        def advance(carry, step):
+            (state, sent), (command, acts) = carry, step
+            wanted = commanded(state, command)
+            sent = wanted if self._num_held == 1 else jnp.where(acts, wanted, sent)
+            state = dynamics.step(world, state, sent, self._substeps)
+            return (state, sent), (whole(dynamics.sensed(world, state)), whole(state))
 
         looks_back = leads or self.host.na > 0
         steps = (past.num_steps if looks_back else num_before) - num_before + np.arange(num_before)
@@ -357,12 +368,21 @@ class Simulator:
         if leads:
             way = way_to(start, past, self.host, self._grid, self._substeps)
             state, _ = jax.lax.scan(lead, state, (way, after >= 0))
-        _, paths = jax.lax.scan(advance, state, ctrl[self._warm_up :])
+        during = ctrl[self._warm_up :]
+        acts = np.arange(len(during)) % self._num_held == 0
+        _, paths = jax.lax.scan(advance, (state, during[0]), (during, acts))
         firsts = (whole(dynamics.sensed(world, state)), whole(state))
         signals, true = (
             jnp.concatenate([first[None], path]) for first, path in zip(firsts, paths, strict=True)
         )
         return self._at_samples(signals, place), true
+
+    def _held_means(self, ctrl):
+        """Return commands [warm_up + steps, nu] as means over the steps that one is held for."""
+        number = (np.arange(len(ctrl)) - self._warm_up) // self._num_held
+        number -= number[0]
+        sums = jax.ops.segment_sum(ctrl, number, number[-1] + 1)
+        return (sums / np.bincount(number)[:, None])[number]
 
     def _at_samples(self, path, place):
         """Interpolate a path on the grid [steps + 1, nq + nv] at the samples."""
