@@ -61,7 +61,8 @@ def choose_bounds(
         )
     limited = host.actuator_ctrllimited.astype(bool)
     lowest, highest = np.where(limited, host.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
-    ctrl = np.clip(np.concatenate([r.ctrl for r in recordings]), lowest, highest)
+    ctrl = np.concatenate([r.ctrl[a:b] for r in recordings for a, b in r.spans])
+    ctrl = np.clip(ctrl, lowest, highest)
     low, high = ctrl.min(axis=0), ctrl.max(axis=0)
     room = (high - low) / 2
     for i in np.flatnonzero(room == 0):

@@ -16,7 +16,7 @@ from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.replay import replay
 from garat_jax.effects import CATALOGUE
 from garat_jax.errors import UserError
-from garat_jax.ground import GroundConfig, ground, load_grounded
+from garat_jax.ground import GroundConfig, ground, learn, load_grounded
 from garat_jax.ground.learn import Best
 from garat_jax.ground.run import load_policy
 from garat_jax.ground.source import make_source, with_transformer
@@ -184,6 +184,24 @@ def test_a_transformer_that_is_worse_than_none_is_not_taken(read, tmp_path):
     assert done.summary["chosen"]["update"] == 0
     assert "which stays as it is" in done.sentence
     assert done.comparison.also[0].error == done.comparison.error.before
+
+
+def test_paths_of_an_only_recording_are_as_dense_as_what_is_learned_from(
+    read, tmp_path, monkeypatch
+):
+    model, (recording, *_) = read
+    count = 3000  # of which 2000 are learned from
+    rows = np.arange(count) % len(recording.time)
+    columns = {name: getattr(recording, name)[rows] for name in ("qpos", "qvel", "ctrl")}
+    time = 0.008 * np.arange(count)
+    only = dataclasses.replace(recording, time=time, spans=((0, count),), **columns)
+
+    def stop(recordings, interval, length, every):
+        raise RuntimeError(f"{recordings[0].spans} every {every}")
+
+    monkeypatch.setattr(learn, "control_paths", stop)
+    with pytest.raises(RuntimeError, match=r"\(\(0, 2000\),\) every 2"):
+        ground(model, [only], SMALL, RunDirectory.create(tmp_path, {}, "test", [0]))
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,17 @@ def test_commands_may_go_half_their_range_beyond_it_within_ctrlrange(read):
     assert bounds.interval == pytest.approx(0.016)  # two samples, the nearest to 0.02 s
 
 
+def test_commands_outside_a_recordings_spans_do_not_count(read):
+    model, recordings = read
+    ctrl = np.linspace(-1.0, 2.0, len(recordings[0].time))[:, None]
+    border = 2 * len(ctrl) // 3
+    first = dataclasses.replace(recordings[0], ctrl=ctrl, spans=((0, border),))
+    bounds = choose_bounds(model, [first])
+    last = ctrl[border - 1, 0]
+    assert bounds.low == pytest.approx(-1.0 - (last + 1.0) / 2)
+    assert bounds.high == pytest.approx(last + (last + 1.0) / 2)
+
+
 def test_recorded_commands_beyond_ctrlrange_count_as_its_ends(read):
     model, recordings = read
     for commands, low in ((np.linspace(1.0, 9.0, len(recordings[0].time)), 0.0), (5.0, -3.0)):
