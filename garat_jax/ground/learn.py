@@ -35,6 +35,7 @@ from garat_jax.methods.recorded import (
     path_error,
 )
 from garat_jax.methods.transition_error import check_differs, constant_error, transition_error
+from garat_jax.plain import to_plain
 from garat_jax.runs import RunDirectory
 from garat_jax.train import FAULTY, Trainer
 from garat_jax.transfer import GroundConfig
@@ -189,6 +190,7 @@ def ground(
     summary = {
         "format": FORMAT,
         "method": config.method,
+        "learner": to_plain(config.learner),
         "model": str(model.path),
         "data": [r.name for r in fitted],
         "holdout": [r.name for r in held_out],

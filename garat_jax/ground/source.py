@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from garat_jax.errors import UserError, choose
 from garat_jax.ground.steps import Bounds
 from garat_jax.methods.make import make_method
 from garat_jax.methods.recorded import RecordedEnv, Steps, as_transitions, clone, cloned
+from garat_jax.plain import to_plain
 from garat_jax.runs import RunDirectory
 from garat_jax.transfer import GroundConfig
 
@@ -70,6 +72,7 @@ def load_grounded(
     if summary["format"] != FORMAT:
         raise UserError(f"{root} was written by another version of garat; ground the model again")
     config = choose("method", summary["method"], configs)
+    _check_settings(root, summary.get("learner", {}), to_plain(config.learner))
     model = dataclasses.replace(load_model(root / CARD, catalogue), path=root)
     if not summary["chosen"]["update"]:
         say(f"{root}: no action transformer was better than none; this is the model as it is")
@@ -97,6 +100,16 @@ def load_grounded(
     transformer = checkpoint.restore(root / TRANSFORMER, like)
     transform = with_transformer(method, env, transformer)
     return dataclasses.replace(model, transform=transform, interval=bounds.interval)
+
+
+def _check_settings(root: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse settings other than those that a run was made with; older ones recorded none."""
+    for name, value in before.items():
+        if now.get(name) != value:
+            raise UserError(
+                f"{root} was made with {name} = {value}, here it is {now.get(name)}; give "
+                "load_grounded the settings that it was made with"
+            )
 
 
 def with_transformer(method, env: RecordedEnv, transformer):

@@ -235,6 +235,17 @@ def test_a_run_of_another_version_is_refused(grounded, tmp_path):
         load_grounded(root, {"gat": SMALL})
 
 
+def test_a_run_made_with_other_settings_is_refused(grounded, tmp_path):
+    other = dataclasses.replace(SMALL, learner=dataclasses.replace(SMALL.learner, num_epochs=7))
+    with pytest.raises(UserError, match=r"was made with num_epochs = 10, here it is 7; give load_"):
+        load_grounded(grounded, {"gat": other})
+    root = shutil.copytree(grounded, tmp_path / "run")
+    summary = json.loads((root / "summary.json").read_text())
+    del summary["learner"]  # as in older runs
+    (root / "summary.json").write_text(json.dumps(summary))
+    load_grounded(root, {"gat": other})
+
+
 def test_a_run_is_read_back(grounded):
     model = load_grounded(grounded, {"gat": SMALL})
     assert model.transform is not None
@@ -309,7 +320,8 @@ def test_a_task_for_another_machine_is_refused(grounded, tmp_path):
 
 
 @pytest.mark.slow
-def test_grounding_reaches_the_table_of_compare(recorded, grounded, tmp_path, capsys):
+def test_grounding_reaches_the_table_of_compare(recorded, grounded, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(presets.GROUNDING, "gat", SMALL)
     model, files, torque = recorded
     card = model.parent / "repaired.toml"
     card.write_text(
