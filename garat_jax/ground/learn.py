@@ -19,6 +19,7 @@ from garat_jax.diagnosis.segments import metric_spread
 from garat_jax.dynamics import Dynamics
 from garat_jax.ground.source import FORMAT, TRANSFORMER, make_source, with_transformer
 from garat_jax.ground.steps import choose_bounds, control_paths, control_steps, draw, longest_path
+from garat_jax.methods.garat import GARATConfig
 from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.grounded import GroundedEnv, Grounding
 from garat_jax.methods.make import make_method
@@ -43,6 +44,8 @@ from garat_jax.types import Params, Policy
 
 MOST_PATHS = 100
 """Recorded paths that the updates of a transformer are compared on, drawn at random."""
+FAR = 0.1
+"""Standard deviations of recorded commands by which a given policy's may be off them."""
 REACH = 3.0
 """Root mean squares of the needed change of a command that a transformer is prepared for."""
 
@@ -60,6 +63,11 @@ class Grounded:
     model: Model
     comparison: Comparison
     summary: Mapping[str, Any]
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What speaks against what was learned, one line each."""
+        return self.summary["warnings"]
 
     @property
     def sentence(self) -> str:
@@ -166,6 +174,10 @@ def ground(
     deviation = np.sqrt(np.mean([noise(r) ** 2 for r in fitted], axis=0))
     env, world = make_source(model, seen.state, deviation, bounds, config.episode)
     agent, agent_params = (cloned(env), clone(env, seen)) if policy is None else (policy, ())
+    has_discriminator = isinstance(config.learner, GARATConfig)
+    warnings = warn_of_policy(env, policy, seen) if policy and has_discriminator else ()
+    for warning in warnings:
+        say(f"warning: {warning}")
     trainer = Trainer(run, [seed])
     say(f"learning an action transformer with {config.method}")
     num_steps = max(1, round(config.episode / bounds.interval))
@@ -196,6 +208,7 @@ def ground(
         "holdout": [r.name for r in held_out],
         "held_out": how,
         "policy": "cloned" if policy is None else "given",
+        "warnings": warnings,
         "control": bounds._asdict(),
         "reach": reach,
         "episode": config.episode,
@@ -210,6 +223,31 @@ def ground(
         "seconds": dataclasses.asdict(trainer.seconds),
     }
     return Grounded(grounded, comparison, summary)
+
+
+def warn_of_policy(env: RecordedEnv, policy: Policy, steps: Steps) -> tuple[str, ...]:
+    """Warn where a given policy's commands are not those of recorded steps.
+
+    A recorded step has the mean command, one in the source that of the policy at its beginning: a
+    discriminator tells them apart by the commands alone. Differences such as between two draws of
+    the policy do not count.
+    """
+    recorded = as_transitions(env, steps)
+    keys = jax.random.split(jax.random.key(0), (2, len(steps.state)))
+    act = jax.vmap(jax.vmap(policy, (None, 0, 0)), (None, None, 0))
+    first, second = env.clip(act((), recorded.obs, keys)[0])
+    action = np.asarray(recorded.action)
+    apart, own = (np.mean(np.square(first - a), axis=0) for a in (action, second))
+    spread = np.maximum(action.std(axis=0), 1e-5 * (env.action_high - env.action_low))
+    off = float(np.max(np.sqrt(np.maximum(apart - 2 * own, 0.0)) / spread))
+    if off <= FAR:
+        return ()
+    return (
+        f"the recorded commands, means over control steps, are {off:.2g} of their standard "
+        "deviations off the policy's at the beginning of each, by which the discriminator knows "
+        "them: leave --policy out, and it is cloned, or record the policy's own commands at its "
+        "own rate, a sample each, and give the time between them as --interval",
+    )
 
 
 def _choose_reach(lesson: Lesson, trainer: Trainer) -> float:

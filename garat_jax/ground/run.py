@@ -179,7 +179,7 @@ def _write_report(run: RunDirectory, done: Grounded, name: str) -> None:
         run.path("report.html"),
         kind="A model grounded in measurements",
         title=f"{summary['method']} on {name}",
-        lead=done.sentence,
+        lead=" ".join([done.sentence, *(f"Warning: {warning}." for warning in done.warnings)]),
         facts=[
             Fact(f"{100 * comparison.error.before:.3g} %", "held-out error of the model as it is"),
             Fact(f"{100 * comparison.also[0].error:.3g} %", "with the action transformer"),

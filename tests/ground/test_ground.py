@@ -147,7 +147,7 @@ def test_a_run_holds_what_scripts_read(grounded):
         ["recording_0.csv", "recording_1.csv"],
         ["recording_2.csv"],
     )
-    assert summary["policy"] == "given"
+    assert (summary["policy"], summary["warnings"]) == ("given", [])
     found = json.loads((grounded / "compare.json").read_text())
     assert found["also"][0]["error"] == summary["error"]["grounded"]
     assert len((grounded / "metrics.jsonl").read_text().splitlines()) == SMALL.num_updates
