@@ -164,10 +164,11 @@ def _read(path: str | Path, model: mujoco.MjModel, column_map: ColumnMap | None)
     return Table(raw.path, column_map.apply(raw.columns))
 
 
-def find_gaps(time: np.ndarray) -> np.ndarray:
-    """Return the indices of the samples, of those at some times [T], after which there is a gap."""
+def between_gaps(time: np.ndarray) -> list[tuple[int, int]]:
+    """Return the index ranges [start, stop) of samples at some times, [T], between gaps."""
     steps = np.diff(time)
-    return np.flatnonzero(steps > GAP * np.median(steps))
+    gaps = np.flatnonzero(steps > GAP * np.median(steps))
+    return list(itertools.pairwise([0, *(int(gap) + 1 for gap in gaps), len(time)]))
 
 
 def longest_span(recordings: Sequence[Recording]) -> float:
@@ -234,11 +235,10 @@ def _split(
     path: Path, name: str, time: np.ndarray
 ) -> tuple[tuple[tuple[int, int], ...], list[str]]:
     """Return the spans between gaps, and what to say about them."""
-    gaps, usual = find_gaps(time), float(np.median(np.diff(time)))
-    borders = [0, *(int(gap) + 1 for gap in gaps), len(time)]
-    parts = list(itertools.pairwise(borders))
+    parts, usual = between_gaps(time), float(np.median(np.diff(time)))
+    gaps = [stop - 1 for _, stop in parts[:-1]]
     spans = tuple((a, b) for a, b in parts if b - a >= FEWEST_SAMPLES)
-    if not len(gaps):
+    if not gaps:
         return spans, []
     if not spans:
         raise UserError(

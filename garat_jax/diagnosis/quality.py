@@ -15,7 +15,7 @@ from scipy import signal
 from garat_jax.diagnosis.columns import signals
 from garat_jax.diagnosis.filters import even_steps, held, held_means, quantum
 from garat_jax.diagnosis.localise import MissingTorque, missing_torque, window_size
-from garat_jax.diagnosis.measurements import Recording, find_gaps, noise
+from garat_jax.diagnosis.measurements import Recording, between_gaps, noise
 from garat_jax.dynamics import Dynamics
 from garat_jax.effects.elements import element_names
 
@@ -82,7 +82,7 @@ def assess(recording: Recording, model: mujoco.MjModel, world: Dynamics | None =
         seconds=float(recording.time[-1] - recording.time[0]),
         rate=1.0 / usual,
         irregularity=float(np.abs(intervals - usual).max() / usual),
-        gaps=len(find_gaps(recording.time)),
+        gaps=len(between_gaps(recording.time)) - 1,
         velocity="measured" if recording.velocity_measured else "estimated",
         channels=_channels(recording, model),
         command_lag=command_lags(recording, model, world),

@@ -5,7 +5,6 @@ positions are no measurements: they say nothing that the positions do not, so th
 """
 
 import dataclasses
-import itertools
 from collections.abc import Sequence
 
 import mujoco
@@ -13,7 +12,7 @@ import numpy as np
 
 from garat_jax.diagnosis.activation import check_known, forgets_in, known_spans
 from garat_jax.diagnosis.filters import UNIFORM
-from garat_jax.diagnosis.measurements import Recording, find_gaps
+from garat_jax.diagnosis.measurements import Recording, between_gaps
 from garat_jax.diagnosis.noise import noise_of
 from garat_jax.errors import UserError
 
@@ -287,8 +286,7 @@ def _past_qvel(recordings: Sequence[Recording], steps: Sequence[np.ndarray]) -> 
     """Return every recording's velocity in the middle of the simulated steps, [R, T, nv]."""
     qvel = np.zeros((len(recordings), max(at[-1] for at in steps), recordings[0].qvel.shape[1]))
     for row, recording, at in zip(qvel, recordings, steps, strict=True):
-        borders = [0, *(find_gaps(recording.time) + 1), len(recording.time)]
-        for a, b in itertools.pairwise(borders):  # also where it is left out or held out
+        for a, b in between_gaps(recording.time):  # also what is left out or held out
             every = np.arange(at[a], at[b - 1])
             speeds = [np.interp(every + 0.5, at[a:b], v) for v in recording.qvel[a:b].T]
             row[every] = np.stack(speeds, axis=1)
