@@ -63,13 +63,11 @@ def fit_contenders(
         refinable: Indices of those of them in whose place a refinement may come.
         scores: What screening says, best first.
         say: Told what is being done.
-        num: How many, those that are like the first counted as one, besides those that turn out to
-            be like the best.
+        num: How many, those like the first counted as one, besides those that are like the best.
     """
     contenders = _fit_refined(problem, current, refinable, scores, say)
     done = {c.score.effect for c in contenders}
-    likely = [s for s in scores if not s.excluded and s.possible and s.share > LIKELY]
-    likely = [s for s in likely if s.effect not in done]
+    likely = [s for s in scores if s.possible and s.share > LIKELY and s.effect not in done]
     likely = [s for s in likely if s.share > 0.25 * likely[0].share]
     likely = [s for s in likely if not simpler_law(problem, s, likely)]
     likely = [s for i, s in enumerate(likely) if not twins(s, likely[:i])]
@@ -132,7 +130,7 @@ def fit_refinements(
         hidden_only: Leave out the laws that screening sees, because they have no threshold.
     """
     simple = contender.score.effect
-    if _acts(problem, simple, current.theta):
+    if acts(problem, simple, current.theta):
         return []
     rival = contender.fit.cost[problem.fitted].sum()
     return [
@@ -154,8 +152,8 @@ def _fit_refined(
     """Fit the laws that refine those of effects selected before, each in the place of the simpler.
 
     Beside what was found since, or over longer segments, the difference may show. Those are fitted
-    that screening expects to explain something that the simpler law leaves, whatever the sign. A
-    law that acted before anything was selected is left as it is.
+    that screening expects to explain something more, whatever the sign. A law that acted before
+    anything was selected is left as it is.
 
     Args:
         problem: The recordings and the model with every candidate.
@@ -165,22 +163,27 @@ def _fit_refined(
         say: Told what is being done.
     """
     simulator, found = problem.simulator, []
-    added = [effect for effect in held if not _acts(problem, effect, simulator.base)]
+    added = [effect for effect in held if not acts(problem, effect, simulator.base)]
     for score in scores:
         if score.excluded or score.share < LIKELY:
             continue
         simpler = [i for i in added if refines(problem, score.effect, i)]
         if refined := as_refined(problem, score, current.theta, simpler):
-            own = [j for i in simpler for j in columns_of(simulator.slots, i).values()]
-            theta = current.theta.copy()
-            theta[own] = simulator.base[own]
-            free = tuple(j for j in current.free if j not in own)
-            without = dataclasses.replace(current, theta=theta, free=free)
+            without = set_aside(problem, current, simpler)
             found.append(fit_one(problem, without, refined, np.inf, say))
     return found
 
 
-def _acts(problem: Problem, effect: int, theta: np.ndarray) -> bool:
+def set_aside(problem: Problem, current: Fit, effects: Sequence[int]) -> Fit:
+    """Return a fit in whose parameters some effects do not act; nothing is fitted again."""
+    own = [j for i in effects for j in columns_of(problem.simulator.slots, i).values()]
+    theta = current.theta.copy()
+    theta[own] = problem.simulator.base[own]
+    free = tuple(j for j in current.free if j not in own)
+    return dataclasses.replace(current, theta=theta, free=free)
+
+
+def acts(problem: Problem, effect: int, theta: np.ndarray) -> bool:
     """Say whether an effect acts under some parameters, [num_parameters]."""
     simulator, law = problem.simulator, problem.simulator.effects[effect]
     none = law.at(simulator.host, law.target)
@@ -394,5 +397,4 @@ def fit_one(problem: Problem, current: Fit, score: Score, rival: float, say) -> 
     theta[list(score.start)] = list(score.start.values())
     free = (*current.free, *score.columns)
     start, sensitivity = current.start, current.sensitivity
-    fitted = fit(problem, theta, start, free, rival=rival, sensitivity=sensitivity)
-    return Contender(score, fitted)
+    return Contender(score, fit(problem, theta, start, free, rival=rival, sensitivity=sensitivity))

@@ -267,12 +267,12 @@ def _unfitted(problem: Problem, score: Score, others: Sequence[Score], why: str)
     )
 
 
-def leads(problem: Problem, first: Fit, second: Fit) -> bool:
-    """Say whether one fit's cost is certainly lower than another's, by more than a trifle."""
+def leads(problem: Problem, first: Fit, second: Fit, by: float = TOO_CLOSE) -> bool:
+    """Say whether one fit's cost is certainly lower than another's, by more than a factor."""
     costs = _block_costs(problem, 1.0, [first, second], slice(None))
     drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
     lead = drawn[:, 1] - drawn[:, 0]
-    return bool(np.quantile(lead, 0.025) > 0 and np.median(lead) > np.log(TOO_CLOSE))
+    return bool(np.quantile(lead, 0.025) > 0 and np.median(lead) > np.log(by))
 
 
 def _block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):

@@ -39,7 +39,7 @@ from garat_jax.diagnosis.metric import (
     trusted,
 )
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rivals import fill_out, refine
+from garat_jax.diagnosis.rivals import fill_out, refine, with_refinements
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle, settle_twice
@@ -134,6 +134,9 @@ def explain(
         candidates = candidates if found.steps else further.candidates
         found, adequate = further, False
         before = settle(found.problem, found.problem.simulator.base, found.fit.start)
+    metric = make_metric(found.problem)
+    refined = with_refinements(found.problem, metric, found.steps, found.fit, say)
+    found = found._replace(steps=refined)
     problem, steps, current, floor, best = _counted(found, say)
     if found.steps and not steps:
         problem, before, floor, adequate = _as_nothing_passed(problem, before, at_first)

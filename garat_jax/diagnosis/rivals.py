@@ -1,12 +1,31 @@
 """More of the laws of the best contender and its rivals: one may be the truth without a part."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Iterator, Sequence
 
-from garat_jax.diagnosis.contend import Contender, best_of, fit_further, fit_refinements
-from garat_jax.diagnosis.judge import held_out_gain, is_certain, leads
+import numpy as np
+
+from garat_jax.diagnosis.contend import (
+    Contender,
+    acts,
+    as_refined,
+    best_of,
+    fit_further,
+    fit_one,
+    fit_refinements,
+    refines,
+    set_aside,
+)
+from garat_jax.diagnosis.findings import Candidate
+from garat_jax.diagnosis.judge import SIGNIFICANCE, estimates, held_out_gain, is_certain, leads
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
 from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.screen import gather
 from garat_jax.diagnosis.starts import Fit
+from garat_jax.diagnosis.steps import Step
+
+HARDLY_MORE = "refines what was added, which leaves hardly more"
+"""Why a law that fits better for certain is not added: a simpler one leaves hardly more."""
 
 
 def refine(problem, metric: Metric, current: Fit, scores, contenders, floor: Floor, say):
@@ -60,3 +79,72 @@ def _replaced(contenders: Sequence[Contender], old: Contender, new: Contender) -
     names = (c.score.effect for c in contenders if c.fit.residual is old.fit.residual)
     replaced = {new.score.effect, *names}
     return [new, *(c for c in contenders if c.score.effect not in replaced)]
+
+
+def with_refinements(
+    problem: Problem, metric: Metric, steps: Sequence[Step], current: Fit, say
+) -> list[Step]:
+    """Name the laws that refine what was added and fit better for certain, if only by a trifle.
+
+    Where a law leaves no more than noise, none that refines it was fitted (`refine`), and what a
+    hidden one explains is lost in the error; evidence shows it all the same. The recordings then do
+    not tell which of the two it is.
+
+    Args:
+        problem: The recordings and the model with every candidate.
+        metric: Of the errors.
+        steps: What was added.
+        current: The fit with all of them.
+        say: Told what is being done.
+    """
+    found = []
+    for step in steps:
+        more = [
+            (_as_refinement(problem, metric, step, current, refined, p_value), refined)
+            for refined, p_value in _evident(problem, step, current, say)
+            if leads(problem, refined.fit, current, by=1.0)
+        ]
+        equals = (*step.candidate.indistinguishable_from, *(c.named for c, _ in more))
+        candidate = dataclasses.replace(step.candidate, indistinguishable_from=equals)
+        found.append(step._replace(candidate=candidate, alike=[*step.alike, *more]))
+    return found
+
+
+def _evident(problem: Problem, step: Step, current: Fit, say) -> Iterator[tuple[Contender, float]]:
+    """Fit the hidden laws that refine a step's, were not tried, and show; yield their p-values."""
+    simulator, simple = problem.simulator, step.effect
+    tried = {contender.score.effect for _, contender in step.alike}
+    for index in range(len(simulator.effects)):
+        is_hidden = refines(problem, index, simple) and problem.num_listed(index) > 1
+        if not is_hidden or index in tried or acts(problem, simple, simulator.base):
+            continue
+        score = dataclasses.replace(step.contender.score, effect=index)
+        refined = as_refined(problem, score, current.theta, [simple])
+        if refined is None:
+            continue
+        without = set_aside(problem, current, [simple])
+        theta = without.theta.copy()
+        theta[list(refined.start)] = list(refined.start.values())
+        _, evidence, _ = gather(problem, current)
+        p_value = evidence.p_value(index, evidence.change(theta[None]))
+        if p_value < SIGNIFICANCE:
+            yield fit_one(problem, without, refined, np.inf, say), p_value
+
+
+def _as_refinement(
+    problem: Problem, metric: Metric, step: Step, current: Fit, refined: Contender, p_value: float
+) -> Candidate:
+    """Return what is said of a law that refines a step's, beside what is said of that."""
+    effect, of = problem.simulator.effects[refined.score.effect], step.candidate
+    cost, simpler = (fit.cost[problem.fitted].sum() for fit in (refined.fit, current))
+    return dataclasses.replace(
+        of,
+        effect=effect.kind,
+        parameters=estimates(problem, refined.score.effect, refined.fit),
+        share=1.0 - (1.0 - of.share) * float(cost / simpler),
+        p_value=p_value,
+        error_after=metric.error(refined.fit.residual, ~problem.fitted),
+        indistinguishable_from=(of.named, *of.indistinguishable_from),
+        passes=False,
+        why=HARDLY_MORE,
+    )

@@ -6,6 +6,7 @@ import functools
 import numpy as np
 import pytest
 
+from garat_jax.diagnosis import rivals
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.diagnose import diagnose
 from garat_jax.diagnosis.findings import Candidate, Interval
@@ -14,9 +15,9 @@ from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.rank import _select
 from garat_jax.diagnosis.rivals import unled
 from garat_jax.diagnosis.screen import Score
-from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.steps import Step
-from garat_jax.effects import CATALOGUE, AsymmetricFriction, CoulombFriction
+from garat_jax.effects import CATALOGUE, AsymmetricFriction, CoulombFriction, StribeckFriction
 from tests import models
 from tests.diagnosis.pendulum import MODEL, record
 from tests.diagnosis.test_fit import make_problem
@@ -124,12 +125,7 @@ def test_a_law_found_before_gives_way_to_its_refinement():
     starts = problem.segments.start
     problem = dataclasses.replace(problem, fitted=np.arange(len(starts)) % 4 > 0)
     found = fit(problem, problem.simulator.base, starts, (coulomb,))
-    nan = float("nan")
-    score = Score(0, (coulomb,), (0.1,), {}, 0.5, 0.0, True, np.zeros(0))
-    named = Candidate(
-        laws[0].kind, laws[0].target, {}, 0.5, 0.0, nan, Interval(nan, nan, nan), 1.0, (), True, ""
-    )
-    step = Step(named, Contender(score, found), found, [])
+    step = step_of(laws[0], found)
     floor = noise_floor(problem, make_metric(problem), found)
     selected = _select(problem, found, floor, [step], lambda line: None)
     assert [step.candidate.effect for step in selected.steps] == ["asymmetric_friction"]
@@ -137,6 +133,40 @@ def test_a_law_found_before_gives_way_to_its_refinement():
     assert coulomb not in selected.fit.free
     assert selected.fit.theta[positive] == pytest.approx(0.08, rel=0.1)
     assert selected.fit.theta[negative] == pytest.approx(0.12, rel=0.1)
+
+
+@pytest.mark.parametrize(("peak", "named"), [(0.0, []), (0.02, ["stribeck_friction"])])
+def test_a_peak_at_rest_that_explains_hardly_more_is_named_as_equal(peak, named):
+    laws = (CoulombFriction("joint/hinge"), StribeckFriction("joint/hinge"))
+
+    def rub(spec):
+        spec.joint("hinge").frictionloss = 0.08 + peak
+
+    def less(speed: float) -> float:
+        return peak * np.sign(speed) * (1.0 - np.exp(-((speed / 0.3) ** 2)))
+
+    problem = make_problem([record(rub, seed, torque=less) for seed in range(2)], laws)
+    starts = problem.segments.start
+    problem = dataclasses.replace(problem, fitted=np.arange(len(starts)) % 4 > 0)
+    found = fit(problem, problem.simulator.base, starts, (0,))
+    step, metric = step_of(laws[0], found), make_metric(problem)
+    (step,) = rivals.with_refinements(problem, metric, [step], found, lambda line: None)
+    assert [n.effect for n in step.candidate.indistinguishable_from] == named
+    assert [candidate.effect for candidate, _ in step.alike] == named
+    for candidate, contender in step.alike:
+        static = candidate.parameters["static"]
+        assert static.low < 0.08 + peak < static.high
+        assert contender.fit.cost.sum() < found.cost.sum()
+        assert candidate.share > step.candidate.share
+
+
+def step_of(law, found: Fit) -> Step:
+    """Return the step that added a law whose parameter is the first."""
+    nan = float("nan")
+    score = Score(0, (0,), (0.1,), {}, 0.5, 0.0, True, np.zeros(0))
+    gain = Interval(nan, nan, nan)
+    named = Candidate(law.kind, law.target, {}, 0.5, 0.0, nan, gain, 1.0, (), True, "")
+    return Step(named, Contender(score, found), found, [])
 
 
 def test_rivals_are_the_best_and_those_that_it_does_not_lead_once_each():
