@@ -178,7 +178,8 @@ def compare(
     say("choosing the horizon")
     stated, segments = choose_horizon(simulator, recordings, grid)
     say(say_horizon(recordings, stated))
-    warnings = warn_of_sampling(grid, host.opt.timestep)
+    warnings = tuple(dict.fromkeys(w for r in recordings for w in r.warnings))
+    warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, recordings, grid, stated)
     warnings += (STILL,) if is_still(segments) else ()
     played = {}

@@ -131,7 +131,7 @@ def quantum(values: np.ndarray) -> float:
     """
     step = _spacing(values)
     bends = np.abs(np.diff(values, 2))
-    bends = bends[bends > 1e-6 * step]
+    bends = bends[bends > 2 * OFF_GRID * step]  # less is rounding
     return step if len(bends) and float(np.median(bends)) > 0.5 * step else 0.0
 
 

@@ -336,7 +336,8 @@ class Simulator:
         def commanded(state, command):
             if self._transform is None:
                 return command
-            return self._transform(whole(dynamics.sensed(world, state)), command)
+            sent = self._transform(whole(dynamics.sensed(world, state)), command)
+            return sent.astype(command.dtype)
 
         def since_begun(has_begun, new, old):
             if not self.host.na:  # an integrator would go on with the first command

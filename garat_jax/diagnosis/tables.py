@@ -186,11 +186,11 @@ def _rows_below(path: Path, header: list[str], separator: str) -> pd.DataFrame:
 
 
 def _read_parquet(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
-    """Read columns by name; an index that has a name is one of them."""
+    """Read columns by name; an index of the name that lacks is one of them."""
     frame = pd.read_parquet(path)
-    if any(name is not None for name in frame.index.names):
-        frame = frame.reset_index()
     frame.columns = frame.columns.map(str)
+    lacking = {"time", *(wanted or ())}.difference(frame.columns)
+    frame = frame.reset_index([name for name in frame.index.names if name in lacking])
     return _numbers(path, _only(path, frame, wanted))
 
 

@@ -46,6 +46,8 @@ MOST_PATHS = 100
 """Recorded paths that the updates of a transformer are compared on, drawn at random."""
 FAR = 0.1
 """Standard deviations of recorded commands by which a given policy's may be off them."""
+CHANCE = 4.0
+"""Part, over the root of their number, by which chance may raise the mean square of differences."""
 REACH = 3.0
 """Root mean squares of the needed change of a command that a transformer is prepared for."""
 
@@ -239,7 +241,8 @@ def warn_of_policy(env: RecordedEnv, policy: Policy, steps: Steps) -> tuple[str,
     action = np.asarray(recorded.action)
     apart, own = (np.mean(np.square(first - a), axis=0) for a in (action, second))
     spread = np.maximum(action.std(axis=0), 1e-5 * (env.action_high - env.action_low))
-    off = float(np.max(np.sqrt(np.maximum(apart - 2 * own, 0.0)) / spread))
+    by_chance = own * (1.0 + CHANCE / np.sqrt(len(action)))
+    off = float(np.max(np.sqrt(np.maximum(apart - by_chance, 0.0)) / spread))
     if off <= FAR:
         return ()
     return (

@@ -18,7 +18,7 @@ from garat_jax.errors import UserError, choose
 from garat_jax.ground.steps import Bounds
 from garat_jax.methods.make import make_method
 from garat_jax.methods.recorded import RecordedEnv, Steps, as_transitions, clone, cloned
-from garat_jax.plain import to_plain
+from garat_jax.plain import finite_or_null, to_plain
 from garat_jax.runs import RunDirectory
 from garat_jax.transfer import GroundConfig
 
@@ -72,7 +72,7 @@ def load_grounded(
     if summary["format"] != FORMAT:
         raise UserError(f"{root} was written by another version of garat; ground the model again")
     config = choose("method", summary["method"], configs)
-    _check_settings(root, summary.get("learner", {}), to_plain(config.learner))
+    _check_settings(root, summary.get("learner", {}), finite_or_null(to_plain(config.learner)))
     model = dataclasses.replace(load_model(root / CARD, catalogue), path=root)
     if not summary["chosen"]["update"]:
         say(f"{root}: no action transformer was better than none; this is the model as it is")
@@ -107,8 +107,8 @@ def _check_settings(root: Path, before: Mapping[str, Any], now: Mapping[str, Any
     for name, value in before.items():
         if now.get(name) != value:
             raise UserError(
-                f"{root} was made with {name} = {value}, here it is {now.get(name)}; give "
-                "load_grounded the settings that it was made with"
+                f"{root} was made with {name} = {value}, here it is {now.get(name)}: ground the "
+                "model again, or give load_grounded the settings that it was made with"
             )
 
 

@@ -11,6 +11,7 @@ from garat_jax.diagnosis import compare, load_model
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.replay import Replay, as_recordings, replay
+from garat_jax.diagnosis.report import write_comparison
 from garat_jax.diagnosis.segments import QUIET, Segments
 from garat_jax.dynamics import Override
 from garat_jax.runs import RunDirectory
@@ -92,6 +93,16 @@ def test_command_writes_what_scripts_read(recorded, tmp_path, capsys):
         assert heading in page
     assert "not white: qpos.hinge, qvel.hinge" in page
     assert "report:" in capsys.readouterr().out
+
+
+def test_what_is_odd_about_recordings_is_in_their_comparison_and_its_report(recorded, tmp_path):
+    model, recordings = read(recorded, "none")
+    odd = dataclasses.replace(recordings[0], warnings=("run.csv: 1 gap",))
+    found = compare(model, [odd, *recordings[1:]])
+    assert found.warnings == ("run.csv: 1 gap",)
+    run = RunDirectory.create(tmp_path / "run", {}, "garat compare", [])
+    page = write_comparison(run, found, model, recordings).read_text()
+    assert "Warnings: run.csv: 1 gap." in page
 
 
 def test_measured_torques_are_compared_where_there_are_any(recorded, tmp_path):

@@ -57,6 +57,29 @@ def test_hinges_with_numbers_for_names_keep_their_signs(tmp_path):
         assert made[f"qpos.arm.{i}"].to_numpy() == pytest.approx(between, abs=0.002)
 
 
+def test_a_sign_is_mended_although_a_driver_began_with_zeros(tmp_path):
+    turn = 3.0 * STAMPS
+    quaternion = np.stack([np.cos(turn), np.sin(turn), 0 * turn, 0 * turn], axis=1)
+    quaternion *= np.where(np.arange(len(turn)) % 2, -1.0, 1.0)[:, None]
+    quaternion[0] = 0.0
+    columns = "\n".join(f'"qpos.ball.{i}" = "/joint_states.position[{i}]"' for i in range(4))
+    made = read_between(tmp_path, lambda k: (["a", "b", "c", "d"], [*quaternion[k]]), columns)
+    length = np.linalg.norm(made[[f"qpos.ball.{i}" for i in range(4)]], axis=1)
+    assert length[1:] == pytest.approx(np.ones(len(made) - 1), abs=1e-3)
+
+
+def test_messages_that_come_in_bursts_leave_no_gaps(tmp_path, monkeypatch):
+    def in_bursts(store, seconds):
+        k = round(seconds * RATE)
+        return stamp(store, (k // 5) * 5 / RATE + (k % 5) * 2e-4)
+
+    monkeypatch.setattr(logs, "stamp", in_bursts)
+    log = write_bag(tmp_path, "mcap")
+    columns = f'"ctrl.motor" = "/effort.data"\n{AT_HINGE}'
+    assert convert_only(tmp_path, log, columns) == 0
+    assert len(pd.read_csv(tmp_path / "data.csv")) > 50
+
+
 def test_states_are_not_invented_across_a_gap(tmp_path):
     def silent_for_a_while(k):
         return ([], []) if 20 <= k < 40 else (["hinge"], [ANGLE[k]])

@@ -69,8 +69,15 @@ def test_parquet_whose_columns_are_numbers_and_whose_index_is_time(tmp_path):
     recording = Recording.read(tmp_path / "log.parquet", MODEL, write(tmp_path, text))
     np.testing.assert_allclose(recording.time, 1e-3 * TIME)
     np.testing.assert_allclose(recording.ctrl[:, 0], FOREIGN["torque"])
-    with pytest.raises(UserError, match="unknown column 't'"):
+    with pytest.raises(UserError, match="unknown column '0'"):
         Recording.read(tmp_path / "log.parquet", MODEL)
+
+
+def test_an_index_that_is_a_column_already_is_left_alone(tmp_path):
+    frame = pd.DataFrame(FOREIGN).set_index("t", drop=False)
+    frame.to_parquet(tmp_path / "log.parquet")
+    recording = Recording.read(tmp_path / "log.parquet", MODEL, write(tmp_path))
+    np.testing.assert_allclose(recording.time, 1e-3 * TIME)
 
 
 def test_npz_takes_a_map_too(tmp_path):

@@ -137,5 +137,14 @@ def test_a_steady_run_is_no_coarse_encoder(bits):
     assert quantum(np.round(0.05 * time / step) * step) == pytest.approx(step)
 
 
+@pytest.mark.parametrize("rounded", [np.float32, lambda angle: np.round(angle, 5)])
+def test_an_encoder_is_told_in_rounded_numbers_at_a_constant_speed(rounded):
+    time, step = 0.001 * np.arange(1600), 2 * np.pi / 2**12
+    for speed in np.linspace(0.2, 3.0, 12):
+        angle = speed * np.abs((time + 0.3) % 4 - 2)
+        coarse = rounded(np.round(angle / step) * step).astype(float)
+        assert quantum(coarse) == pytest.approx(step, rel=0.02)
+
+
 def test_torque_per_command_is_gear_and_gain():
     np.testing.assert_allclose(torque_per_command(ARM), [[60.0, 0.0], [0.0, 2.0]], atol=1e-6)

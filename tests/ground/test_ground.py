@@ -237,7 +237,7 @@ def test_a_run_of_another_version_is_refused(grounded, tmp_path):
 
 def test_a_run_made_with_other_settings_is_refused(grounded, tmp_path):
     other = dataclasses.replace(SMALL, learner=dataclasses.replace(SMALL.learner, num_epochs=7))
-    with pytest.raises(UserError, match=r"was made with num_epochs = 10, here it is 7; give load_"):
+    with pytest.raises(UserError, match=r"was made with num_epochs = 10, here it is 7: ground the"):
         load_grounded(grounded, {"gat": other})
     root = shutil.copytree(grounded, tmp_path / "run")
     summary = json.loads((root / "summary.json").read_text())

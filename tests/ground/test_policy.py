@@ -64,6 +64,8 @@ def test_a_policy_is_warned_of_whose_commands_were_not_the_recorded_ones(read):
     (late,) = warnings(read, feedback, feedback, 0.08)  # means over ten samples
     (other,) = warnings(read, lambda *seen: (0.5 * feedback(*seen)[0], 0.0), feedback, 0.008)
     assert "leave --policy out" in late
+    (off,) = warnings(read, noisy, lambda *seen: (noisy(*seen)[0] + 0.2, 0.0), 0.008)
+    assert "are 0." in off
     assert "are 0.5 of their standard deviations off" in other
 
 
