@@ -82,7 +82,8 @@ def _with_warnings(lead: str, warnings: Sequence[str]) -> str:
         return lead
     more = len(warnings) - MOST_WARNINGS
     rest = f"; and {more} more, below" if more > 0 else ""
-    told = f"{lead} Warnings: {'; '.join(warnings[:MOST_WARNINGS])}{rest}"
+    word = "Warning" if len(warnings) == 1 else "Warnings"
+    told = f"{lead} {word}: {'; '.join(warnings[:MOST_WARNINGS])}{rest}"
     return told if told.endswith("?") else f"{told}."
 
 

@@ -102,7 +102,7 @@ def test_what_is_odd_about_recordings_is_in_their_comparison_and_its_report(reco
     assert found.warnings == ("run.csv: 1 gap",)
     run = RunDirectory.create(tmp_path / "run", {}, "garat compare", [])
     page = write_comparison(run, found, model, recordings).read_text()
-    assert "Warnings: run.csv: 1 gap." in page
+    assert "Warning: run.csv: 1 gap." in page
 
 
 def test_measured_torques_are_compared_where_there_are_any(recorded, tmp_path):

@@ -148,7 +148,7 @@ def test_what_is_odd_about_recordings_is_a_warning_of_their_diagnosis():
     recordings[1] = dataclasses.replace(recordings[1], warnings=("one.csv: is it in degrees?",))
     found = diagnose(model, recordings)
     assert found.warnings == ("one.csv: is it in degrees?",)
-    assert diagnosis_lead(found).endswith(" Warnings: one.csv: is it in degrees?")
+    assert diagnosis_lead(found).endswith(" Warning: one.csv: is it in degrees?")
 
 
 def test_a_small_effect_is_found_that_a_large_one_hid():
