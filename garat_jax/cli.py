@@ -19,12 +19,13 @@ from tyro.conf import Positional
 
 from garat_jax import __version__, compilation_cache
 from garat_jax.commandline import PROGRAM, arg, how_to_go_on, parse
-from garat_jax.commands.console import complain, make_run, print_table, say
+from garat_jax.commands.checks import make_run
 from garat_jax.commands.diagnosis import Compare, Diagnose, Ground, Improve, Plan
 from garat_jax.commands.machine import Device, Doctor
 from garat_jax.commands.models import Add, Convert, Effects, Export
 from garat_jax.errors import DivergedError, EarlierRunStays, UserError, choose
 from garat_jax.interrupt import interruptible
+from garat_jax.terminal import complain, print_table, say
 
 DESCRIPTION = "Ground a simulator in data, and find the physical effect that it is missing."
 

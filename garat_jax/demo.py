@@ -17,6 +17,7 @@ from garat_jax.envs.pairs import PAIRS
 from garat_jax.presets import garat
 from garat_jax.report import Fact, Section
 from garat_jax.runs import RunDirectory
+from garat_jax.terminal import say
 from garat_jax.transfer import run_transfer
 
 PAIR = "inverted_pendulum_heavy"
@@ -45,9 +46,7 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
     seeds = range(seed, seed + config.seeds)
     part = _part(run, "transfer", {"pair": PAIR}, seeds, resume=run.resumed)
     transfer = run_transfer(config, part)
-    Console(highlight=False, markup=False, emoji=False, soft_wrap=True).print(
-        summary.describe(transfer)
-    )
+    say(summary.describe(transfer))
 
     console.rule("2. A hidden effect: which physics does the model lack?")
     hidden = make_recordings(PENDULUM, run.path("measurements"), seed)

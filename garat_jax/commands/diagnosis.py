@@ -9,15 +9,15 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from garat_jax.commandline import arg
-from garat_jax.commands.console import (
+from garat_jax.commands.checks import (
     check_files,
     check_once,
     check_optional,
     make_run,
-    say,
     writing,
 )
 from garat_jax.errors import UserError, choose
+from garat_jax.terminal import say
 
 
 @dataclasses.dataclass(frozen=True)

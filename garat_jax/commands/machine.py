@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal
 
-from garat_jax.commands.console import print_table, say
+from garat_jax.terminal import print_table, say
 
 Device = Literal["auto", "cpu", "gpu", "tpu"]
 

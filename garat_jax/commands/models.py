@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from garat_jax.commandline import arg
-from garat_jax.commands.console import (
+from garat_jax.commands.checks import (
     check_files,
     check_once,
     check_optional,
-    print_table,
-    say,
     writing,
 )
 from garat_jax.errors import UserError
+from garat_jax.terminal import print_table, say
 
 if TYPE_CHECKING:
     from garat_jax.effects import Effect

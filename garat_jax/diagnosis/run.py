@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.console import Console
-
+from garat_jax import terminal
 from garat_jax.diagnosis.conditions import (
     add_conditions,
     check_conditions,
@@ -78,5 +77,5 @@ def run_diagnose(
         sections = diagnosis_sections(diagnosis, loaded, recordings, held_out)
         sections += condition_sections(diagnosis, loaded, others)
         write_diagnosis(run, diagnosis, loaded.name, sections)
-    Console(highlight=False, markup=False, emoji=False, soft_wrap=True).print(str(diagnosis))
+    terminal.say(str(diagnosis))
     return Diagnosed(diagnosis, sections)

@@ -1,4 +1,4 @@
-"""What commands share: words on the terminal, checks of files, the run directory. No JAX."""
+"""What commands share: checks of files, and the run directory. No JAX."""
 
 import contextlib
 import dataclasses
@@ -9,40 +9,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.table import Table
-
 from garat_jax.commandline import PROGRAM
 from garat_jax.errors import UserError
 from garat_jax.interrupt import interruptible
+from garat_jax.terminal import complain
 
 if TYPE_CHECKING:
     from garat_jax.runs import RunDirectory
 
 LARGEST_SEED = 2**31 - 1
 """Seeds are 32-bit integers in JAX; larger ones would draw what smaller ones do."""
-
-
-def complain(message: str, status: int) -> int:
-    """Print one line on stderr and return the exit status that goes with it."""
-    line = " ".join(message.split())
-    sys.stderr.write(f"{PROGRAM}: {line}\n")
-    return status
-
-
-def say(message: str) -> None:
-    """Print one line on stdout, as it is."""
-    Console(soft_wrap=True, highlight=False, markup=False, emoji=False).print(message)
-
-
-def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table, as wide as the terminal or, where there is none, as its content."""
-    table = Table(*columns)
-    for row in rows:
-        table.add_row(*row)
-    console = Console()
-    width = console.width if console.is_terminal else max(console.width, 160)
-    Console(width=width, markup=False, emoji=False).print(table)
 
 
 @contextlib.contextmanager
