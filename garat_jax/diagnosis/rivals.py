@@ -1,7 +1,7 @@
 """More of the laws of the best contender and its rivals: one may be the truth without a part."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,11 +16,12 @@ from garat_jax.diagnosis.contend import (
     refines,
     set_aside,
 )
+from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.judge import SIGNIFICANCE, estimates, held_out_gain, is_certain, leads
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.screen import gather
+from garat_jax.diagnosis.screen import Score, gather
 from garat_jax.diagnosis.starts import Fit
 from garat_jax.diagnosis.steps import Step
 
@@ -97,11 +98,18 @@ def with_refinements(
         current: The fit with all of them.
         say: Told what is being done.
     """
+    hidden = [_hidden(problem, step, current) for step in steps]
+    if not any(hidden):
+        return list(steps)
+    _, evidence, _ = gather(problem, current)
     found = []
-    for step in steps:
+    for step, scores in zip(steps, hidden, strict=True):
+        without = set_aside(problem, current, [step.effect])
         more = [
             (_as_refinement(problem, metric, step, current, refined, p_value), refined)
-            for refined, p_value in _evident(problem, step, current, say)
+            for score in scores
+            if (p_value := _p_value(evidence, score, without.theta)) < SIGNIFICANCE
+            for refined in [fit_one(problem, without, score, np.inf, say)]
             if leads(problem, refined.fit, current, by=1.0)
         ]
         equals = (*step.candidate.indistinguishable_from, *(c.named for c, _ in more))
@@ -110,25 +118,32 @@ def with_refinements(
     return found
 
 
-def _evident(problem: Problem, step: Step, current: Fit, say) -> Iterator[tuple[Contender, float]]:
-    """Fit the hidden laws that refine a step's, were not tried, and show; yield their p-values."""
+def _hidden(problem: Problem, step: Step, current: Fit) -> list[Score]:
+    """Return the hidden laws that refine a step's and were not tried, each as that was fitted."""
     simulator, simple = problem.simulator, step.effect
+    if acts(problem, simple, simulator.base):
+        return []
     tried = {contender.score.effect for _, contender in step.alike}
-    for index in range(len(simulator.effects)):
-        is_hidden = refines(problem, index, simple) and problem.num_listed(index) > 1
-        if not is_hidden or index in tried or acts(problem, simple, simulator.base):
-            continue
-        score = dataclasses.replace(step.contender.score, effect=index)
-        refined = as_refined(problem, score, current.theta, [simple])
-        if refined is None:
-            continue
-        without = set_aside(problem, current, [simple])
-        theta = without.theta.copy()
-        theta[list(refined.start)] = list(refined.start.values())
-        _, evidence, _ = gather(problem, current)
-        p_value = evidence.p_value(index, evidence.change(theta[None]))
-        if p_value < SIGNIFICANCE:
-            yield fit_one(problem, without, refined, np.inf, say), p_value
+    scores = (
+        dataclasses.replace(step.contender.score, effect=index)
+        for index in range(len(simulator.effects))
+        if index not in tried and refines(problem, index, simple) and problem.num_listed(index) > 1
+    )
+    begun = (as_refined(problem, score, current.theta, [simple]) for score in scores)
+    return [score for score in begun if score is not None]
+
+
+def _p_value(evidence: Evidence, refined: Score, theta: np.ndarray) -> float:
+    """Return how likely errors would show a law that begins as a simpler one, which is set aside.
+
+    Args:
+        evidence: What the segments say beside all that was added.
+        refined: The law, with where it begins.
+        theta: The parameters without the simpler one, [num_parameters].
+    """
+    begun = theta.copy()
+    begun[list(refined.start)] = list(refined.start.values())
+    return evidence.p_value(refined.effect, evidence.change(begun[None]))
 
 
 def _as_refinement(
