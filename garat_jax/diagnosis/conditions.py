@@ -19,6 +19,7 @@ from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.diagnose import diagnose, split, thin
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.guesses import with_guesses
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording, checked
@@ -244,6 +245,7 @@ def _fit_together(
         if _is_fitted(candidates[slot.effect], slot.parameter.name)
     ]
     best = count_timestep(problem, fit(problem, joint.base, start, free))
+    best = with_guesses(problem, range(len(candidates)), best)
     refined = iter(
         dataclasses.replace(c, parameters=estimates(problem, number, best))
         for number, c in enumerate(candidates)

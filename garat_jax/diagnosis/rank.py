@@ -24,6 +24,7 @@ from garat_jax.diagnosis.contend import (
 )
 from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.guesses import with_guesses
 from garat_jax.diagnosis.horizon import cut_ever_longer, cut_longer
 from garat_jax.diagnosis.judge import NIL, Judged, estimates, judge
 from garat_jax.diagnosis.measurements import Recording
@@ -134,8 +135,7 @@ def explain(
         candidates = candidates if found.steps else further.candidates
         found, adequate = further, False
         before = settle(found.problem, found.problem.simulator.base, found.fit.start)
-    metric = make_metric(found.problem)
-    refined = with_refinements(found.problem, metric, found.steps, found.fit, say)
+    refined = with_refinements(found.problem, found.steps, found.fit, say)
     found = found._replace(steps=refined)
     problem, steps, current, floor, best = _counted(found, say)
     if found.steps and not steps:
@@ -145,8 +145,7 @@ def explain(
     selected = apart([shown[step.candidate.named] for step in steps])
     shown |= {c.named: c for c in selected}
     candidates = _with_nil(tuple(shown.get(c.named, c) for c in candidates), found.steps, steps)
-    if not is_above(problem, make_metric(problem), current, floor):
-        best = None
+    is_left = is_above(problem, make_metric(problem), current, floor)
     return Outcome(
         problem,
         before,
@@ -156,7 +155,7 @@ def explain(
         selected,
         floor,
         adequate and not steps,
-        best,
+        best if is_left else None,
     )
 
 
@@ -379,6 +378,7 @@ def _as_shown(problem: Problem, steps: Sequence[Step], final: Fit) -> dict[Named
     Sizes are those of the final fit where one fit serves both, else those of the round.
     """
     shown, selected = {}, [step.candidate.named for step in steps]
+    final = with_guesses(problem, [step.effect for step in steps], final)
     for step in steps:
         own, equals = step.candidate.named, step.candidate.indistinguishable_from
         for candidate, contender in [(step.candidate, step.contender), *step.alike]:

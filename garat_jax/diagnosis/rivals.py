@@ -19,7 +19,7 @@ from garat_jax.diagnosis.contend import (
 from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.judge import SIGNIFICANCE, estimates, held_out_gain, is_certain, leads
-from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
+from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, make_metric
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.screen import Score, gather
 from garat_jax.diagnosis.starts import Fit
@@ -82,9 +82,7 @@ def _replaced(contenders: Sequence[Contender], old: Contender, new: Contender) -
     return [new, *(c for c in contenders if c.score.effect not in replaced)]
 
 
-def with_refinements(
-    problem: Problem, metric: Metric, steps: Sequence[Step], current: Fit, say
-) -> list[Step]:
+def with_refinements(problem: Problem, steps: Sequence[Step], current: Fit, say) -> list[Step]:
     """Name the laws that refine what was added and fit better for certain, if only by a trifle.
 
     Where a law leaves no more than noise, none that refines it was fitted (`refine`), and what a
@@ -93,7 +91,6 @@ def with_refinements(
 
     Args:
         problem: The recordings and the model with every candidate.
-        metric: Of the errors.
         steps: What was added.
         current: The fit with all of them.
         say: Told what is being done.
@@ -101,7 +98,7 @@ def with_refinements(
     hidden = [_hidden(problem, step, current) for step in steps]
     if not any(hidden):
         return list(steps)
-    _, evidence, _ = gather(problem, current)
+    metric, (_, evidence, _) = make_metric(problem), gather(problem, current)
     found = []
     for step, scores in zip(steps, hidden, strict=True):
         without = set_aside(problem, current, [step.effect])

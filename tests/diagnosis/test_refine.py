@@ -149,8 +149,8 @@ def test_a_peak_at_rest_that_explains_hardly_more_is_named_as_equal(peak, named)
     starts = problem.segments.start
     problem = dataclasses.replace(problem, fitted=np.arange(len(starts)) % 4 > 0)
     found = fit(problem, problem.simulator.base, starts, (0,))
-    step, metric = step_of(laws[0], found), make_metric(problem)
-    (step,) = rivals.with_refinements(problem, metric, [step], found, lambda line: None)
+    step = step_of(laws[0], found)
+    (step,) = rivals.with_refinements(problem, [step], found, lambda line: None)
     assert [n.effect for n in step.candidate.indistinguishable_from] == named
     assert [candidate.effect for candidate, _ in step.alike] == named
     for candidate, contender in step.alike:
