@@ -1,12 +1,12 @@
 """Where no candidate passes by itself, or a simple law may be hidden: look one effect further.
 
 Of two effects that are missing, neither explains so much by itself that no third can rival it, and
-the other may drown what it gains on what is held out. And a law that refines another may do some of
-what that one does with a further effect.
+the other may drown what it gains on what is held out; of three, not even two may gain there for
+certain. And a law that refines another may do some of what that one does with a further effect.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from garat_jax.diagnosis.contend import Contender, refines
@@ -23,13 +23,18 @@ from garat_jax.diagnosis.judge import (
 from garat_jax.diagnosis.metric import AT_FLOOR, Metric, is_above, noise_floor
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.starts import Fit
-from garat_jax.diagnosis.steps import Step
+from garat_jax.diagnosis.steps import Step, fit_only, prune
 
 RIVALS = 2
 """How many candidates behind the first are followed for one more effect."""
 LOOK_AHEAD = 2
 """Effects held from which rivals are not followed any more: each path is a round of its own, and
 rounds take longer with every effect held."""
+AT_ONCE = 4
+"""Effects that are added at once, at most."""
+LARGE = 0.3
+"""Share of what is left that each of these explains, at least: less, and so few do not explain all
+of an error that is far above its floor."""
 TOGETHER = "passes every gate together with "
 
 
@@ -71,8 +76,8 @@ def choose(
     metric: Metric,
     current: Fit,
     judged: Judged,
-    num_held: int,
-    follow: Callable[[Contender], Judged],
+    held: Sequence[int],
+    follow: Callable[[Sequence[int], Contender], Judged],
     say: Callable[[str], None],
 ) -> tuple[Judged, list[Step]]:
     """Return a round's candidates and what of them is to be added, which may need another.
@@ -82,20 +87,32 @@ def choose(
         metric: Of the errors.
         current: The fit of the effects selected so far.
         judged: The candidates, best first.
-        num_held: How many effects are selected so far.
-        follow: Returns the round that would follow one.
+        held: The effects selected so far.
+        follow: Returns the round that would follow one beside some effects.
         say: Told what is being done.
 
     Returns:
         The candidates, the first of which passes if with another it leads its rivals with another,
         or if all that these do not lead add it, too, or the same beside another first; and what is
         to be added: the first if it passes, with the other if it needs that and no third explains
-        as much; a next round may tell these.
+        as much; a next round may tell these. Where nothing is held and nothing passes so, several
+        that explain all, if each is needed.
     """
     followed = []
-    for candidate, contender in _rivals(problem, metric, judged, num_held)[: 1 + RIVALS]:
+    for candidate, contender in _rivals(problem, metric, judged, len(held))[: 1 + RIVALS]:
         say(f"looking for what would be missing beside {candidate.named}")
-        followed.append(Path(candidate, contender, follow(contender)))
+        followed.append(Path(candidate, contender, follow(held, contender)))
+    judged, steps = _one_or_two(problem, metric, current, judged, followed)
+    if steps or held:
+        return judged, steps
+    then = {path.contender.score.effect: path.then for path in followed}
+    return _several(problem, metric, current, judged, then, follow, say)
+
+
+def _one_or_two(
+    problem: Problem, metric: Metric, current: Fit, judged: Judged, followed: Sequence[Path]
+) -> tuple[Judged, list[Step]]:
+    """Return a round's candidates and what is to be added, by paths with one more; see `choose`."""
     if not followed:
         return judged, first_step(problem, judged, current)
     best = min(followed, key=lambda path: path.fit.cost.sum())
@@ -118,6 +135,75 @@ def choose(
     if len(undecided) == 1 or is_second:
         steps += first_step(problem, best.then, best.contender.fit)
     return judged, steps
+
+
+def _several(
+    problem: Problem,
+    metric: Metric,
+    current: Fit,
+    judged: Judged,
+    known: Mapping[int, Judged],
+    follow: Callable[[Sequence[int], Contender], Judged],
+    say: Callable[[str], None],
+) -> tuple[Judged, list[Step]]:
+    """Return a round's candidates and several to be added at once; none if they do not explain all.
+
+    The first that lacks only what others may drown is taken, round after round, until one passes
+    every gate beside those and no more than noise is left. Each of them has to be needed then.
+
+    Args:
+        problem: What is fitted.
+        metric: Of the errors.
+        current: The fit of no effect.
+        judged: The candidates, best first.
+        known: The rounds that would follow some effects, by these.
+        follow: Returns the round that would follow one beside some effects.
+        say: Told what is being done.
+    """
+    steps: list[Step] = []
+    fit, then, is_all = current, judged, False
+    while not is_all:
+        likely = [(c, k) for c, k in then if k and _may_be_one_of_several(c)]
+        if not likely or len(steps) == AT_ONCE:
+            return judged, []
+        candidate, contender = likely[0]
+        taken = dataclasses.replace(candidate, passes=True)
+        others = [(c, k) for c, k in then if k is not contender]
+        effects = [step.effect for step in steps]
+        steps += first_step(problem, [(taken, contender), *others], fit)
+        fit = contender.fit
+        floor = noise_floor(problem, metric, fit)
+        is_all = candidate.passes and not is_above(problem, metric, fit, floor, AT_FLOOR)
+        if not is_all:
+            say(f"looking for what else would be missing beside {candidate.named}")
+            is_known = not effects and contender.score.effect in known
+            then = known[contender.score.effect] if is_known else follow(effects, contender)
+    steps, fit = prune(problem, steps, fit, steps[:-1], say)
+    if not all(_is_needed(problem, metric, steps, fit, step) for step in steps):
+        return judged, []
+    steps = [_as_one_of(steps, step) for step in steps]
+    first = steps[0]
+    others = [(c, k) for c, k in judged if c.named != first.candidate.named]
+    return [(first.candidate, first.contender), *others], steps
+
+
+def _may_be_one_of_several(candidate: Candidate) -> bool:
+    """Say whether a candidate explains much and lacks at most what other effects may drown."""
+    return candidate.share > LARGE and (candidate.passes or candidate.why in ANOTHER_MAY_HELP)
+
+
+def _is_needed(problem: Problem, metric: Metric, steps: Sequence[Step], fit: Fit, step: Step):
+    """Say whether errors grow for certain without a step, those that are held out among them."""
+    without = fit_only(problem, fit, [other.effect for other in steps if other is not step])
+    gain = held_out_gain(problem, metric, without, fit)
+    return leads(problem, fit, without) and is_certain(gain)
+
+
+def _as_one_of(steps: Sequence[Step], step: Step) -> Step:
+    """Return a step of which is said what it passes together with."""
+    others = [str(other.candidate.named) for other in steps if other is not step]
+    candidate = dataclasses.replace(step.candidate, why=TOGETHER + " and ".join(others))
+    return step._replace(candidate=candidate)
 
 
 def _shared(undecided: Sequence[Path], judged: Judged) -> tuple[Candidate, Contender, bool] | None:

@@ -269,8 +269,8 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}{_beside(problem, held)}")
         judged = _round(problem, metric, current, held, floor, say, refinable=held)
-        follow = functools.partial(_follow, problem, metric, held, say)
-        judged, chosen = choose(problem, metric, current, judged, len(held), follow, say)
+        follow = functools.partial(_follow, problem, metric, say)
+        judged, chosen = choose(problem, metric, current, judged, held, follow, say)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         contender = judged[0][1] if judged else None
         best = contender.fit if contender is not None else best
@@ -336,7 +336,7 @@ def _round(
     return judge(problem, metric, current, scores, contenders, floor)
 
 
-def _follow(problem: Problem, metric: Metric, held, say, contender: Contender) -> Judged:
+def _follow(problem: Problem, metric: Metric, say, held, contender: Contender) -> Judged:
     """Return the round that would follow if a contender were added to the effects held.
 
     Two that do not lead each other may both make the model adequate: what is still missing beside

@@ -70,7 +70,7 @@ def chosen(
 
     seconds = {DAMPING: second_of_damping, GRAVITY: second_of_gravity}
 
-    def follow(contender: Contender):
+    def follow(held, contender: Contender):
         beside = seconds.get(contender.score.effect)
         if beside is None:
             return [pair(DAMPING, 0.8, NO_CERTAIN_GAIN)]
@@ -86,7 +86,7 @@ def chosen(
     judged[GRAVITY] = gravity, fitted
     metric = make_metric(problem)
     say = [].append
-    judged, steps = choose(problem, metric, current, judged, num_held, follow, say)
+    judged, steps = choose(problem, metric, current, judged, [*range(num_held)], follow, say)
     return judged[0][0], [step.candidate.named for step in steps]
 
 
