@@ -164,7 +164,7 @@ def _several(
     fit, then, is_all = current, judged, False
     while not is_all:
         likely = [(c, k) for c, k in then if k and _may_be_one_of_several(c)]
-        if not likely or len(steps) == AT_ONCE:
+        if not likely:
             return judged, []
         candidate, contender = likely[0]
         taken = dataclasses.replace(candidate, passes=True)
@@ -172,15 +172,19 @@ def _several(
         effects = [step.effect for step in steps]
         steps += first_step(problem, [(taken, contender), *others], fit)
         fit = contender.fit
-        floor = noise_floor(problem, metric, fit)
-        is_all = candidate.passes and not is_above(problem, metric, fit, floor, AT_FLOOR)
+        is_all = candidate.passes and _is_at_floor(problem, metric, fit)
+        if not is_all and len(steps) == AT_ONCE:
+            return judged, []
         if not is_all:
             say(f"looking for what else would be missing beside {candidate.named}")
             is_known = not effects and contender.score.effect in known
             then = known[contender.score.effect] if is_known else follow(effects, contender)
     steps, fit = prune(problem, steps, fit, steps[:-1], say)
-    if not all(_is_needed(problem, metric, steps, fit, step) for step in steps):
+    is_all = len(steps) > 1 and _is_at_floor(problem, metric, fit)
+    if not is_all or not all(_is_needed(problem, metric, steps, fit, step) for step in steps):
         return judged, []
+    last = dataclasses.replace(steps[-1].contender, fit=fit)  # without what went
+    steps = [*steps[:-1], steps[-1]._replace(contender=last)]
     steps = [_as_one_of(steps, step) for step in steps]
     first = steps[0]
     others = [(c, k) for c, k in judged if c.named != first.candidate.named]
@@ -190,6 +194,11 @@ def _several(
 def _may_be_one_of_several(candidate: Candidate) -> bool:
     """Say whether a candidate explains much and lacks at most what other effects may drown."""
     return candidate.share > LARGE and (candidate.passes or candidate.why in ANOTHER_MAY_HELP)
+
+
+def _is_at_floor(problem: Problem, metric: Metric, fit: Fit) -> bool:
+    """Say whether a fit leaves no more than noise."""
+    return not is_above(problem, metric, fit, noise_floor(problem, metric, fit), AT_FLOOR)
 
 
 def _is_needed(problem: Problem, metric: Metric, steps: Sequence[Step], fit: Fit, step: Step):

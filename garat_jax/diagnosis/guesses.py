@@ -6,7 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from garat_jax.diagnosis.differences import clear_differences, projected
-from garat_jax.diagnosis.problem import Problem
+from garat_jax.diagnosis.problem import Problem, block_labels, block_stretches
+from garat_jax.diagnosis.robust import directions, jackknife
 from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import Fit
 
@@ -25,37 +26,54 @@ def with_guesses(problem: Problem, effects: Sequence[int], fitted: Fit) -> Fit:
         effects: Indices of the effects that act.
         fitted: The fit with all of them.
     """
-    free = [j for j in fitted.free if j not in fitted.frozen]
+    half = (fitted.high - fitted.low) / 2.0
+    known = [i for i, j in enumerate(fitted.free) if j not in fitted.frozen and half[i] < np.inf]
     guesses = [j for i in effects for j in _guesses(problem, i, fitted)]
-    if not free or not guesses:
+    if not known or not guesses:
         return fitted
-    at = [fitted.free.index(j) for j in free]
-    half = (fitted.high - fitted.low)[at] / 2.0
-    differences = clear_differences(problem, fitted.theta, fitted.start, (*free, *guesses))
+    columns = (*(fitted.free[i] for i in known), *guesses)
+    differences = clear_differences(problem, fitted.theta, fitted.start, columns)
     sensitivity, residual = projected(problem, differences.linearisation)
-    known, guessed = np.split(sensitivity, [len(free)], axis=1)
-    inverse = np.linalg.pinv(known)
-    answer = -inverse @ guessed  # by how much the fitted ones make up for each guess
-    told = guessed + known @ answer
-    alone = np.linalg.norm(inverse, axis=1)  # standard deviations, were errors white
-    is_known = np.isfinite(half) & (alone > 0)
-    times = np.max(half[is_known] / alone[is_known], initial=1.0)
+    basis, back = directions(sensitivity[:, : len(known)])
+    guessed = sensitivity[:, len(known) :]
+    answer = -back @ (basis.T @ guessed)  # by how much the fitted ones make up for each guess
+    told = guessed - basis @ (basis.T @ guessed)
+    half_width = _half_widths(problem, told, residual)
     parameters = [problem.simulator.slots[j].parameter for j in guesses]
-    reach = np.asarray([(p.high - p.low) / 2.0 for p in parameters])
-    told, answer = told * reach / times, answer * reach
-    information = told.T @ told + np.eye(len(guesses))
-    shift = answer @ np.linalg.solve(information, -told.T @ residual / times)
-    spread = np.einsum("ki,ij,kj->k", answer, np.linalg.inv(information), answer)
-    wider = np.hypot(half, np.sqrt(spread)) - half
-    low, high = fitted.low.copy(), fitted.high.copy()
-    low[at] += np.minimum(shift, 0.0) - wider
-    high[at] += np.maximum(shift, 0.0) + wider
-    return dataclasses.replace(fitted, low=low, high=high)
+    low, high = (np.asarray([getattr(p, end) for p in parameters]) for end in ("low", "high"))
+    reach = (high - low) / 2.0
+    known_of = told / half_width
+    left = np.linalg.inv(known_of.T @ known_of + np.diag(reach**-2.0))
+    step = -left @ (known_of.T @ residual / half_width)
+    best = np.clip(fitted.theta[guesses] + step, low, high)
+    shift = answer @ (best - fitted.theta[guesses])
+    spread = np.sqrt(np.einsum("ki,ij,kj->k", answer, left, answer))
+    wider = np.hypot(half[known], spread) - half[known]
+    ends = fitted.low.copy(), fitted.high.copy()
+    ends[0][known] += np.minimum(shift, 0.0) - wider
+    ends[1][known] += np.maximum(shift, 0.0) + wider
+    return dataclasses.replace(fitted, low=ends[0], high=ends[1])
 
 
 def _guesses(problem: Problem, effect: int, fitted: Fit) -> list[int]:
     """Return the parameters that an effect's first one switches on and that were not fitted."""
     if problem.simulator.effects[effect].independent:
         return []
-    columns = columns_of(problem.simulator.slots, effect)
-    return [j for j in columns.values() if j not in fitted.free]
+    _, *others = columns_of(problem.simulator.slots, effect).values()
+    return [j for j in others if j not in fitted.free]
+
+
+def _half_widths(problem: Problem, told: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return half-widths of a 95 % interval of each guess by itself, were its column of norm 1.
+
+    Errors last within blocks of time and beyond; were they white, it would be 1.96.
+
+    Args:
+        problem: What was fitted.
+        told: What the guesses change that nothing fitted makes up for, [M, k].
+        residual: [M].
+    """
+    labels, stretches = block_labels(problem)[problem.fitted].ravel(), block_stretches(problem)
+    found = [jackknife(column[:, None], residual, labels, stretches) for column in told.T]
+    deviation = np.sqrt([regression.covariance[0, 0] for regression in found])
+    return 1.96 * np.maximum(deviation * np.linalg.norm(told, axis=0), 1.0)

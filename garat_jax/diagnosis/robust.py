@@ -39,7 +39,7 @@ def regress(columns: np.ndarray, residual: np.ndarray, labels: np.ndarray) -> Re
         residual: [M].
         labels: The block of each residual, integers, [M].
     """
-    return _regress(*_directions(columns), residual, labels)[0]
+    return _regress(*directions(columns), residual, labels)[0]
 
 
 def jackknife(
@@ -60,7 +60,7 @@ def jackknife(
         stretches: The stretch in which the block with each label lies, by label: blocks of one
             follow each other.
     """
-    basis, back = _directions(columns)
+    basis, back = directions(columns)
     found, scores = _regress(basis, back, residual, labels)
     size = basis.shape[1]
     own = [_by_block(basis * direction[:, None], labels) for direction in basis.T]
@@ -94,7 +94,7 @@ def _regress(
     return Regression(-back @ along, covariance, rest, freedom), scores
 
 
-def _directions(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def directions(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal directions of columns [M, r], and their part in coefficients, [k, r]."""
     unit = np.linalg.norm(columns, axis=0)
     unit = np.where(unit > 0, unit, 1.0)

@@ -106,11 +106,25 @@ def test_three_that_explain_all_and_are_needed_are_added_at_once(problem):
 
 
 def test_one_that_only_led_to_the_others_goes_again(problem):
-    assert [*added(problem, (OFFSET, DAMPING, GRAVITY, FRICTION))] == [DAMPING, GRAVITY, FRICTION]
+    steps = added(problem, (OFFSET, DAMPING, GRAVITY, FRICTION))
+    assert [*steps] == [DAMPING, GRAVITY, FRICTION]
+    last = steps[FRICTION]
+    for found in (last.fit, last.contender.fit):
+        assert found.theta[OFFSET] == 0.0
+        assert OFFSET not in found.free
+
+
+def test_one_that_is_left_alone_had_no_rivals_and_is_not_added():
+    assert not added(problem_of(rub, nothing), (OFFSET, DAMPING, FRICTION))
 
 
 def test_what_leaves_more_than_noise_is_not_added(problem):
     assert not added(problem, (DAMPING, OFFSET, GRAVITY))
+
+
+def test_four_that_leave_more_than_noise_are_not_followed_further(problem, monkeypatch):
+    monkeypatch.setattr("garat_jax.diagnosis.ahead.AT_ONCE", 2)
+    assert not added(problem, (DAMPING, GRAVITY, FRICTION))
 
 
 def test_many_that_explain_little_each_are_not_added(problem):
