@@ -197,8 +197,13 @@ def _may_be_one_of_several(candidate: Candidate) -> bool:
 
 
 def _is_at_floor(problem: Problem, metric: Metric, fit: Fit) -> bool:
-    """Say whether a fit leaves no more than noise."""
-    return not is_above(problem, metric, fit, noise_floor(problem, metric, fit), AT_FLOOR)
+    """Say whether a fit leaves no more than noise in all signals together, and in each hardly more.
+
+    One of many signals may be a little above its floor by chance.
+    """
+    floor = noise_floor(problem, metric, fit)
+    error = metric.error(fit.residual, ~problem.fitted)
+    return error <= AT_FLOOR * floor.error and not is_above(problem, metric, fit, floor)
 
 
 def _is_needed(problem: Problem, metric: Metric, steps: Sequence[Step], fit: Fit, step: Step):
