@@ -72,6 +72,7 @@ def test_an_upward_import_breaks_the_contracts(tmp_path):
         "files",
         "plain",
         "provenance",
+        "terminal",
     )
     for name in ("__init__", "cli", "report", "summary", *words):
         (package / f"{name}.py").touch()
