@@ -42,9 +42,9 @@ def with_guesses(problem: Problem, effects: Sequence[int], fitted: Fit) -> Fit:
     parameters = [problem.simulator.slots[j].parameter for j in guesses]
     low, high = (np.asarray([getattr(p, end) for p in parameters]) for end in ("low", "high"))
     reach = (high - low) / 2.0
-    known_of = told / half_width
-    left = np.linalg.inv(known_of.T @ known_of + np.diag(reach**-2.0))
-    step = -left @ (known_of.T @ residual / half_width)
+    weighted = told / half_width
+    left = np.linalg.inv(weighted.T @ weighted + np.diag(reach**-2.0))
+    step = -left @ (weighted.T @ residual / half_width)
     best = np.clip(fitted.theta[guesses] + step, low, high)
     shift = answer @ (best - fitted.theta[guesses])
     spread = np.sqrt(np.einsum("ki,ij,kj->k", answer, left, answer))
