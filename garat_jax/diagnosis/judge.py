@@ -1,6 +1,7 @@
 """Hold fitted candidates against each other, and say which passes every gate."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -31,6 +32,8 @@ reach bounds by adding steps."""
 TOO_FEW = "too few pieces of recordings to be certain"
 NIL = "at a timestep of 0 it is not firmly told from what the model has"
 """Why one that passed every other gate is not added."""
+PASSING = "passes every gate"
+PASSING_IN_TURN = PASSING + ", with each recording held out in turn: those held out hardly show it"
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
 BEHIND = "another explains more for certain"
 NO_CERTAIN_GAIN = "the held-out error does not fall for certain"
@@ -49,6 +52,7 @@ def judge(
     scores: Sequence[Score],
     contenders: Sequence[Contender],
     floor: Floor,
+    in_turn: Mapping[int, Interval] = MappingProxyType({}),
 ) -> Judged:
     """Return every score's candidate, with its contender if it was fitted, best first.
 
@@ -63,10 +67,12 @@ def judge(
         scores: What screening says.
         contenders: Those that were fitted.
         floor: The noise floor.
+        in_turn: Falls of the error with each recording held out in turn, by effect, that count in
+            place of those on what is held out; see `cross_validation.gains_in_turn`.
     """
     judged = []
     if contenders:
-        costs = _block_costs(problem, 1.0, [c.fit for c in contenders], slice(None))
+        costs = block_costs(problem, 1.0, [c.fit for c in contenders], slice(None))
         num_blocks = costs.shape[1]
         num_free = np.asarray([len(c.fit.free) for c in contenders])
         penalty = num_free * np.log(num_blocks) / num_blocks
@@ -76,7 +82,8 @@ def judge(
         alike = _alike(problem, current, contenders, at_floor, drawn, penalty)
         order = [int(index) for index in np.argsort(criterion)]
         found = {
-            i: _judge_one(problem, metric, current, contenders, i, alike, drawn) for i in order
+            i: _judge_one(problem, metric, current, contenders, i, alike, drawn, in_turn)
+            for i in order
         }
         near = {order[0], *alike[order[0]]}
         passing = [i for i in order if i in near and found[i][0].passes]
@@ -149,7 +156,9 @@ def do_the_same(current: Fit, one: Contender, other: Contender) -> bool:
     return bool(max(cosine(one.score, other.score), abs(a @ b) / size) > EQUIVALENT)
 
 
-def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, alike, drawn):
+def _judge_one(
+    problem, metric: Metric, current: Fit, contenders, index: int, alike, drawn, in_turn
+):
     contender, alike = contenders[index], alike[index]
     others = [i for i in range(len(contenders)) if i != index and i not in alike]
     stability = float(np.mean(np.isin(drawn.argmin(axis=1), [index, *alike])))
@@ -161,9 +170,12 @@ def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, al
             lead = -np.inf
     gain = held_out_gain(problem, metric, current, contender.fit)
     share = 1.0 - contender.fit.cost[problem.fitted].sum() / current.cost[problem.fitted].sum()
-    why = TOO_FEW
+    why, passing = TOO_FEW, PASSING
     if is_enough(problem):
         why = _failed_gate(contender.score, share, gain, lead, stability)
+    if why == NO_CERTAIN_GAIN and contender.score.effect in in_turn:
+        gain_in_turn, passing = in_turn[contender.score.effect], PASSING_IN_TURN
+        why = _failed_gate(contender.score, share, gain_in_turn, lead, stability)
     effects = problem.simulator.effects
     named = [effects[contenders[i].score.effect] for i in alike]
     candidate = Candidate(
@@ -177,7 +189,7 @@ def _judge_one(problem, metric: Metric, current: Fit, contenders, index: int, al
         stability=stability,
         indistinguishable_from=tuple(Named(e.kind, e.target) for e in named),
         passes=not why,
-        why=why or "passes every gate",
+        why=why or passing,
     )
     return candidate, contender
 
@@ -205,9 +217,13 @@ def _failed_gate(score: Score, share: float, gain: Interval, lead: float, stabil
 
 def held_out_gain(problem: Problem, metric: Metric, before: Fit, after: Fit) -> Interval:
     """Return the fall of the held-out error with a block-bootstrap interval."""
-    held_out = ~problem.fitted
-    costs = _block_costs(problem, metric.weight, [before, after], held_out)
-    count = metric.count(held_out)
+    return fall(problem, metric, before, after, ~problem.fitted)
+
+
+def fall(problem: Problem, metric: Metric, before: Fit, after: Fit, chosen: np.ndarray) -> Interval:
+    """Return the fall of the error in chosen segments with a block-bootstrap interval."""
+    costs = block_costs(problem, metric.weight, [before, after], chosen)
+    count = metric.count(chosen)
     drawn = np.sqrt(_resamples(costs.shape[1]) @ costs.T / count)
     whole = np.sqrt(costs.sum(axis=1) / count)
     low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [0.025, 0.975])
@@ -269,13 +285,13 @@ def _unfitted(problem: Problem, score: Score, others: Sequence[Score], why: str)
 
 def leads(problem: Problem, first: Fit, second: Fit, by: float = TOO_CLOSE) -> bool:
     """Say whether one fit's cost is certainly lower than another's, by more than a factor."""
-    costs = _block_costs(problem, 1.0, [first, second], slice(None))
+    costs = block_costs(problem, 1.0, [first, second], slice(None))
     drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
     lead = drawn[:, 1] - drawn[:, 0]
     return bool(np.quantile(lead, 0.025) > 0 and np.median(lead) > np.log(by))
 
 
-def _block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):
+def block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):
     """Return each fit's cost in each block of the chosen segments, [num_fits, num_blocks]."""
     labels = np.unique(block_labels(problem)[chosen].ravel(), return_inverse=True)[1]
     return np.stack([np.bincount(labels, (f.residual[chosen] ** 2 * weight).ravel()) for f in fits])

@@ -13,26 +13,15 @@ from typing import NamedTuple
 import numpy as np
 
 from garat_jax.diagnosis.ahead import choose
-from garat_jax.diagnosis.contend import (
-    CONTENDERS,
-    Contender,
-    complete,
-    fit_contenders,
-    under_another_name,
-    with_evidence,
-    with_twins,
-)
+from garat_jax.diagnosis.contend import Contender, complete, under_another_name
 from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.guesses import with_guesses
 from garat_jax.diagnosis.horizon import cut_ever_longer, cut_longer
-from garat_jax.diagnosis.judge import NIL, Judged, estimates, judge
+from garat_jax.diagnosis.judge import NIL, estimates
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import (
-    ABOVE_FLOOR,
-    AT_FLOOR,
     Floor,
-    Metric,
     is_above,
     make_metric,
     noise_floor,
@@ -40,16 +29,14 @@ from garat_jax.diagnosis.metric import (
     trusted,
 )
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.rivals import fill_out, refine, with_refinements
-from garat_jax.diagnosis.screen import screen
+from garat_jax.diagnosis.rivals import with_refinements
+from garat_jax.diagnosis.rounds import follow_up, run_round
 from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle, settle_twice
 from garat_jax.diagnosis.steps import Step, fit_only, least_firm, prune, reconsider, refitted
 from garat_jax.diagnosis.timestep import count_timestep
 
 ROUNDS = 5
-FOLLOWED = 2
-"""Candidates that are fitted beside each rival that is followed for one more effect."""
 AS_GOOD = "as good as what was added, beside what else was found"
 """Why a candidate that failed a gate by itself is no worse in the end."""
 
@@ -268,8 +255,8 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
             break
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}{_beside(problem, held)}")
-        judged = _round(problem, metric, current, held, floor, say, refinable=held)
-        follow = functools.partial(_follow, problem, metric, say)
+        judged = run_round(problem, metric, current, held, floor, say, refinable=held)
+        follow = functools.partial(follow_up, problem, metric, say)
         judged, chosen = choose(problem, metric, current, judged, held, follow, say)
         first_round = first_round or tuple(candidate for candidate, _ in judged)
         contender = judged[0][1] if judged else None
@@ -298,53 +285,6 @@ def _beside(problem: Problem, held: Sequence[int]) -> str:
     effects = [problem.simulator.effects[i] for i in held]
     names = [str(Named(effect.kind, effect.target)) for effect in effects]
     return f", beside {' and '.join(names)}" if names else ""
-
-
-def _round(
-    problem: Problem,
-    metric: Metric,
-    current: Fit,
-    held: Sequence[int],
-    floor: Floor,
-    say: Callable[[str], None],
-    refinable: Sequence[int] = (),
-    above: float = ABOVE_FLOOR,
-    num: int = CONTENDERS,
-) -> Judged:
-    """Screen the candidates, fit the likely ones and judge them all.
-
-    Args:
-        problem: The recordings and the model with every candidate.
-        metric: Of the errors.
-        current: The fit of the effects selected so far.
-        held: Their indices.
-        floor: The noise floor.
-        say: Told what is being done.
-        refinable: Those of them in whose place a refinement may come.
-        above: Multiple of the floor above which candidates are fitted.
-        num: How many are; see `fit_contenders`.
-    """
-    gap = is_above(problem, metric, current, floor, above)
-    scores = screen(problem, current, held)
-    contenders = fit_contenders(problem, current, refinable, scores, say, num) if gap else []
-    contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
-    contenders = refine(problem, metric, current, scores, contenders, floor, say)
-    contenders = fill_out(problem, metric, contenders, floor, say)
-    contenders = with_twins(problem, current, scores, contenders, say)
-    num_tests = len([score for score in scores if not score.excluded])
-    contenders = with_evidence(problem, current, contenders, num_tests)
-    return judge(problem, metric, current, scores, contenders, floor)
-
-
-def _follow(problem: Problem, metric: Metric, say, held, contender: Contender) -> Judged:
-    """Return the round that would follow if a contender were added to the effects held.
-
-    Two that do not lead each other may both make the model adequate: what is still missing beside
-    them tells which it is.
-    """
-    effects = [*held, contender.score.effect]
-    floor = noise_floor(problem, metric, contender.fit)
-    return _round(problem, metric, contender.fit, effects, floor, say, above=AT_FLOOR, num=FOLLOWED)
 
 
 def _completed(problem: Problem, added: Sequence[Contender], say) -> Contender:

@@ -1,13 +1,23 @@
 """Which of several candidates counts, by what each leaves."""
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Interval
-from garat_jax.diagnosis.judge import TOO_FEW, _at_end, is_certain, judge
+from garat_jax.diagnosis.judge import (
+    NO_CERTAIN_GAIN,
+    PASSING,
+    PASSING_IN_TURN,
+    TOO_FEW,
+    _at_end,
+    is_certain,
+    judge,
+)
 from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS
 from garat_jax.diagnosis.screen import Score
@@ -35,6 +45,7 @@ def judged(
     large: float = 10.0,
     other_noise: bool = False,
     num_held_out: int | None = None,
+    in_turn: Mapping[int, Interval] = MappingProxyType({}),
 ):
     """Judge two laws that do much the same to a large residual, and leave some of the noise.
 
@@ -46,6 +57,7 @@ def judged(
         large: What the residual is beside the noise, in its units.
         other_noise: Whether the richer law leaves noise of its own, and was expected to.
         num_held_out: In how many of the segments that are held out the laws do anything; None: all.
+        in_turn: Falls of the error with each recording held out in turn.
     """
     start = settle(problem, problem.simulator.base, problem.segments.start)
     rng = np.random.default_rng(0)
@@ -74,7 +86,7 @@ def judged(
     metric = make_metric(problem)
     floor = noise_floor(problem, metric, start)
     scores = [rich.score, simple.score]
-    found = judge(problem, metric, current, scores, [rich, simple], floor)
+    found = judge(problem, metric, current, scores, [rich, simple], floor, in_turn)
     return [candidate for candidate, _ in found]
 
 
@@ -148,6 +160,17 @@ def test_a_law_that_seldom_acts_counts_if_it_does_on_what_is_held_out(
     first, *_ = judged(problem, 1.0, 1.0, num_held_out=num_held_out)
     assert first.held_out_gain.low <= 0
     assert first.passes == passes
+
+
+@pytest.mark.parametrize(("low", "passes"), [(0.1, True), (-0.1, False)])
+def test_with_each_recording_held_out_in_turn_the_fall_has_to_be_certain_too(problem, low, passes):
+    fall = Interval(1.0, low, 2.0)
+    first, *_ = judged(problem, 1.0, 1.0, num_held_out=0, in_turn={0: fall, 1: fall})
+    assert first.passes == passes
+    assert first.why == (PASSING_IN_TURN if passes else NO_CERTAIN_GAIN)
+    assert first.held_out_gain.estimate == 0.0
+    (first, *_) = judged(problem, 1.0, 1.0, in_turn={0: fall, 1: fall})
+    assert first.why == PASSING
 
 
 def test_a_fall_is_certain_if_no_resample_rises_by_more_than_a_trifle_of_it():
