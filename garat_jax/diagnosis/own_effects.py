@@ -195,6 +195,8 @@ def _check_choices(effect: Effect, host: mujoco.MjModel) -> None:
         raise _mistake(effect, "starts", "starts lists no size at which to try it")
     for size in sizes:
         effect.beside(size, size)
+        opposite = effect.opposite(size)
+        _check_sizes(effect, "opposite", [] if opposite is None else [opposite])
 
 
 def _check_sizes(effect: Effect, method: str, sizes: Any) -> None:

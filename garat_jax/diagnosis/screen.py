@@ -18,7 +18,15 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.robust import orthonormal, without
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import Fit
-from garat_jax.diagnosis.trials import Row, Trial, best_sizes, enlarge, firsts, others
+from garat_jax.diagnosis.trials import (
+    Row,
+    Trial,
+    best_sizes,
+    enlarge,
+    firsts,
+    others,
+    with_opposites,
+)
 
 EQUIVALENT = 0.95
 """Cosine of two candidates' contributions above which the recordings cannot tell them apart."""
@@ -162,6 +170,7 @@ def _measure(
         for index, new in zip(tried, found.T[other], strict=True):
             rows[index], trials[index] = larger[index]
             changes[:, index] = new
+    rows, trials, changes = with_opposites(problem, rows, trials, changes)
     num_firsts = len(rows)
     best = best_sizes(simulator, rows, trials, weight[:, None] * changes, weight * residual)
     rows, trials = others(simulator, theta, rows, best)

@@ -101,6 +101,33 @@ def _sizes(problem: Problem[Simulator], theta: np.ndarray, index: int, columns: 
     return tuple({first.name: min(factor * size, first.high)} for factor in (0.5, 2.0))
 
 
+def with_opposites(
+    problem: Problem[Simulator], rows: list[Row], trials: list[Trial], changes: np.ndarray
+) -> tuple[list[Row], list[Trial], np.ndarray]:
+    """Add the trials of what changes the opposite, which need no simulation.
+
+    Args:
+        problem: What is screened.
+        rows: One a trial.
+        trials: The candidates at their sizes, in the order of the rows.
+        changes: What the rows change, [M, rows].
+    """
+    simulator, of = problem.simulator, []
+    more, others = list(rows), list(trials)
+    for index, (row, trial) in enumerate(zip(rows, trials, strict=True)):
+        names = columns_of(simulator.slots, trial.effect)
+        given = {name: trial.start[j] for name, j in names.items() if j in trial.start}
+        if given not in problem.starts(trial.effect):  # more or less of what acts already
+            continue
+        opposite = simulator.effects[trial.effect].opposite(given)
+        if opposite is not None:
+            start = {names[name]: value for name, value in opposite.items()}
+            others.append(trial._replace(start=start, rows=(len(more),)))
+            more.append(row._replace(values=start))
+            of.append(index)
+    return more, others, np.concatenate([changes, -changes[:, of]], axis=1)
+
+
 def best_sizes(
     simulator: Simulator,
     rows: list[Row],

@@ -233,6 +233,15 @@ class Effect(abc.ABC):
         return ({first.name: cls.at(host, target)[first.name] + first.scale},)
 
     @classmethod
+    def opposite(cls, start: Mapping[str, float]) -> Mapping[str, float] | None:
+        """Return what changes predictions by the negative of a small one of `starts`, if anything.
+
+        It is tried without being simulated.
+        """
+        del start
+        return None
+
+    @classmethod
     def beside(cls, start: Mapping[str, float], given: Mapping[str, float]) -> Mapping[str, float]:
         """Return one of `starts`, adapted to parameters that a user gives."""
         return {**start, **given}

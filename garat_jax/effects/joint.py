@@ -28,8 +28,16 @@ SMOOTH = 3
 CLEAR = 0.1
 """Torque that a line rises by over the position's spread, relative to the torques' median distance
 from theirs, below which it is lost among them."""
+SLOW = (0.5, 2.0)
+"""Periods in the range of the angle between which a ripple is slow: fewer are a line, more stand
+out of the spectrum."""
+STEP = 0.25
+"""Periods in the range of the angle by which those differ that are tried for a slow ripple."""
+FEWEST = 20
+"""Samples from which a slow ripple is told."""
 PEAKS = 2
-"""Ripples that each torque suggests: noise of fast motion may stand out more than a small one."""
+"""Fast ripples that each torque suggests: noise of fast motion may stand out more than a small
+one."""
 
 
 @struct.dataclass
@@ -246,33 +254,43 @@ class CoggingTorque(Effect):
         )
 
     @classmethod
+    def opposite(cls, start: Mapping[str, float]) -> Mapping[str, float] | None:
+        """Return the ripple half a period late."""
+        return {**start, "phase": start["phase"] - np.copysign(np.pi, start["phase"])}
+
+    @classmethod
     def suggested(
         cls, position: np.ndarray, torque: np.ndarray, rests: np.ndarray
     ) -> Suggestion | None:
         """Return the ripples that stand out of the missing torques' spectra over the angle.
 
         Each is taken away before the next is looked for, or that were its sidelobe (Högbom 1974).
-        Slower ripples than two periods in the range of the angle are hard to tell from other laws.
+        Of slower ripples than two periods in the range of the angle, which are hard to tell from
+        other laws there, the one counts that explains most beside a line.
         """
         del torque
         span = float(np.ptp(position))
         amplitude, periods, _ = cls.parameters()
-        low, high = max(periods.low, 4 * np.pi / max(span, 1e-9)), periods.high
-        if low >= high:
+        slow, fast = (max(periods.low, n * 2 * np.pi / max(span, 1e-9)) for n in SLOW)
+        if slow >= periods.high:
             return None
         starts = []
         for rest in rests:
             counts = np.isfinite(rest)
             angle, rest = position[counts], rest[counts]
+            slowest = _slow_ripple(angle, rest, slow, min(fast, periods.high))
             for _ in range(PEAKS):
-                peak = _highest_peak(angle, rest, low, high)
+                peak = _highest_peak(angle, rest, fast, periods.high)
                 if peak is None:
                     break
-                size, phase, _ = _wave(peak, angle, rest)
+                size, phase, _ = _wave(peak, angle, rest, SMOOTH)
                 rest = rest - size * np.sin(peak * angle + phase)
-                size = min(size, amplitude.high)
                 starts.append({"amplitude": size, "periods": peak, "phase": phase})
-        num_tried = len(rests) * math.ceil((high - low) * span / (2 * np.pi))
+            starts += slowest
+        starts = [
+            {**start, "amplitude": min(start["amplitude"], amplitude.high)} for start in starts
+        ]
+        num_tried = len(rests) * math.ceil((periods.high - slow) * span / (2 * np.pi))
         return Suggestion(tuple(starts), num_tried)
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
@@ -299,19 +317,35 @@ def _highest_peak(position: np.ndarray, torque: np.ndarray, low: float, high: fl
     highest = step * peaks[np.argmax(spectrum[peaks])]
     bounds = max(low, highest - step), min(high, highest + step)
     best = optimize.minimize_scalar(
-        lambda periods: _wave(periods, position, torque)[2], bounds=bounds, method="bounded"
+        lambda periods: _wave(periods, position, torque, SMOOTH)[2], bounds=bounds, method="bounded"
     )
     return float(best.x)
 
 
-def _wave(periods: float, position: np.ndarray, torque: np.ndarray) -> tuple[float, float, float]:
-    """Fit a ripple with some periods beside a smooth law of the position.
+def _slow_ripple(position: np.ndarray, torque: np.ndarray, low: float, high: float):
+    """Return the ripple in a band, in periods a turn, that explains most beside a line, if any.
+
+    A polynomial that follows more than a line would do much of what it does.
+    """
+    span = float(np.ptp(position))
+    if low >= high or len(position) < FEWEST or not span:
+        return []
+    grid = np.arange(low, high, 2 * np.pi * STEP / span)
+    periods = min(grid, key=lambda n: _wave(n, position, torque, 1)[2])
+    size, phase, _ = _wave(periods, position, torque, 1)
+    return [{"amplitude": size, "periods": float(periods), "phase": phase}]
+
+
+def _wave(
+    periods: float, position: np.ndarray, torque: np.ndarray, degree: int
+) -> tuple[float, float, float]:
+    """Fit a ripple with some periods beside a polynomial of the position.
 
     Returns:
         Its amplitude, its phase and the sum of squares that both leave.
     """
     centred = 2.0 * (position - position.min()) / np.ptp(position) - 1.0
-    smooth = np.polynomial.polynomial.polyvander(centred, SMOOTH)
+    smooth = np.polynomial.polynomial.polyvander(centred, degree)
     waves = np.stack([np.sin(periods * position), np.cos(periods * position)], axis=1)
     columns = np.concatenate([waves, smooth], axis=1)
     factor = np.linalg.lstsq(columns, torque, rcond=None)[0]

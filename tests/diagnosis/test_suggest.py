@@ -27,7 +27,7 @@ def test_any_number_of_periods_stands_out_of_the_spectrum(periods):
 def test_a_second_ripple_stands_out_before_the_sidelobes_of_the_first():
     angle = 2.0 * np.sin(np.linspace(0, 20, 8000))
     torque = 0.1 * np.sin(6 * angle) + 0.02 * np.sin(42 * angle + 0.3)
-    first, second = CoggingTorque.suggested(angle, torque, torque[None]).starts
+    first, second, _ = CoggingTorque.suggested(angle, torque, torque[None]).starts
     assert (first["periods"], second["periods"]) == pytest.approx((6, 42), abs=0.05)
     assert (first["amplitude"], second["amplitude"]) == pytest.approx((0.1, 0.02), rel=0.05)
 
@@ -37,6 +37,23 @@ def test_what_is_left_of_slower_laws_does_not_hide_a_ripple():
     torque = 0.2 * angle**3 + 0.02 * np.sin(17 * angle)
     starts = CoggingTorque.suggested(angle, torque, torque[None]).starts
     assert min(abs(start["periods"] - 17) for start in starts) < 0.3
+
+
+@pytest.mark.parametrize("periods", [3.3, 4.7, 6.0])
+def test_a_ripple_of_one_or_two_periods_in_the_range_is_suggested_beside_a_spring(periods):
+    rng = np.random.default_rng(0)
+    angle = np.sin(np.linspace(0, 40, 4000))
+    torque = 0.1 * np.sin(periods * angle - 2.5) - 0.4 * angle + 0.1 * rng.normal(size=len(angle))
+    slow = CoggingTorque.suggested(angle, torque, torque[None]).starts[-1]
+    wave = slow["amplitude"] * np.sin(slow["periods"] * angle + slow["phase"])
+    assert slow["periods"] == pytest.approx(periods, abs=0.6)
+    assert np.corrcoef(wave, np.sin(periods * angle - 2.5))[0, 1] > 0.9
+
+
+def test_a_few_samples_suggest_no_slow_ripple():
+    angle = np.linspace(-1, 1, 15)
+    starts = CoggingTorque.suggested(angle, angle, np.sin(5 * angle)[None]).starts
+    assert all(start["periods"] > 6.0 for start in starts)
 
 
 def test_a_controller_that_fights_the_ripple_does_not_hide_it():

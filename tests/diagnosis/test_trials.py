@@ -10,7 +10,7 @@ from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.screen import _measure, screen
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.trials import enlarge, firsts
-from garat_jax.effects import Backlash, GravityTilt, JointFlexibility, TorqueOffset
+from garat_jax.effects import Backlash, CoggingTorque, GravityTilt, JointFlexibility, TorqueOffset
 from tests import models
 from tests.diagnosis import pendulum
 from tests.diagnosis.test_fit import MODEL, UNIFORM, candidates, column, make_problem, record
@@ -136,3 +136,33 @@ def test_a_step_grows_until_it_stands_out_of_what_contacts_add():
     assert start == {0: row.step}
     assert 2.0 < row.step < 10.0
     assert changes[:, 0] @ wave / np.linalg.norm(changes) / np.linalg.norm(wave) > 0.8
+
+
+@pytest.mark.parametrize("phase", [0.6, 2.2, -2.4, -0.8])
+def test_a_ripple_is_scored_in_whatever_phase_it_is(phase):
+    def rippled(seed):
+        return pendulum.record(
+            lambda spec: None, seed, ripple=lambda q: 0.05 * np.sin(6 * q + phase)
+        )
+
+    problem = make_problem([rippled(0), rippled(1)], [CoggingTorque("joint/hinge")])
+    simulator = problem.simulator
+    settled = settle(problem, simulator.base, problem.segments.start)
+    (score,) = screen(problem, settled)
+    start = {simulator.slots[j].parameter.name: value for j, value in score.start.items()}
+    assert score.possible and score.share > 0.85
+    assert start["periods"] == 6.0 and start["amplitude"] > 0
+    assert np.cos(start["phase"] - phase) > 0.5
+
+
+def test_of_a_ripple_that_the_model_has_more_and_less_are_scored():
+    law = CoggingTorque("joint/hinge", amplitude=0.02, periods=6.0, phase=-2.4)
+
+    def rippled(seed):
+        return pendulum.record(lambda spec: None, seed, ripple=lambda q: 0.05 * np.sin(6 * q - 2.4))
+
+    problem = make_problem([rippled(0), rippled(1)], [law])
+    settled = settle(problem, problem.simulator.base, problem.segments.start)
+    (score,) = screen(problem, settled)
+    assert score.possible and score.share > 0.9
+    assert score.start == {0: pytest.approx(0.04)}

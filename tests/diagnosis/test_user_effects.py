@@ -195,6 +195,7 @@ def test_what_fields_returns_is_checked(mine, old, new, said):
         ("starts(cls, host, target)", "return ({'stiffness': '1'},)", "stiffness = '1', not a"),
         ("starts(cls, host, target)", "return ({},)", "starts lists a size without parameters"),
         ("beside(cls, start, given)", "return start.stifness", "line 27): AttributeError"),
+        ("opposite(cls, start)", "return {'stiffness': -1.0}", "opposite has stiffness = -1.0"),
         ("starts(cls, host, target)", "return 1 / 0", "line 27): ZeroDivisionError"),
         ("at(cls, host, target)", "return {'stifness': 0.0}", "unexpected keyword argument"),
         ("fits(cls, host, element, name)", "return host.name", "line 27): AttributeError"),
