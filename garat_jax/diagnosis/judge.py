@@ -33,7 +33,6 @@ TOO_FEW = "too few pieces of recordings to be certain"
 NIL = "at a timestep of 0 it is not firmly told from what the model has"
 """Why one that passed every other gate is not added."""
 PASSING = "passes every gate"
-PASSING_IN_TURN = PASSING + ", with each recording held out in turn: those held out hardly show it"
 NO_CERTAIN_LEAD = "its lead over the runner-up is not certain"
 BEHIND = "another explains more for certain"
 NO_CERTAIN_GAIN = "the held-out error does not fall for certain"
@@ -174,8 +173,13 @@ def _judge_one(
     if is_enough(problem):
         why = _failed_gate(contender.score, share, gain, lead, stability)
     if why == NO_CERTAIN_GAIN and contender.score.effect in in_turn:
-        gain_in_turn, passing = in_turn[contender.score.effect], PASSING_IN_TURN
-        why = _failed_gate(contender.score, share, gain_in_turn, lead, stability)
+        fallen = in_turn[contender.score.effect]
+        why = _failed_gate(contender.score, share, fallen, lead, stability)
+        passing = (
+            f"passes every gate with each recording held out in turn (the error falls by "
+            f"{fallen.estimate:.3g}, {fallen.low:.3g} to {fallen.high:.3g}): those held out hardly "
+            "show it"
+        )
     effects = problem.simulator.effects
     named = [effects[contenders[i].score.effect] for i in alike]
     candidate = Candidate(

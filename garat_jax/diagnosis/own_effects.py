@@ -196,7 +196,11 @@ def _check_choices(effect: Effect, host: mujoco.MjModel) -> None:
     for size in sizes:
         effect.beside(size, size)
         opposite = effect.opposite(size)
-        _check_sizes(effect, "opposite", [] if opposite is None else [opposite])
+        if opposite is not None:
+            _check_sizes(effect, "opposite", [opposite])
+            if {*opposite} != {*size}:
+                what = f"opposite of {dict(size)!r} has other parameters: {dict(opposite)!r}"
+                raise _mistake(effect, "opposite", what)
 
 
 def _check_sizes(effect: Effect, method: str, sizes: Any) -> None:

@@ -106,6 +106,9 @@ def with_opposites(
 ) -> tuple[list[Row], list[Trial], np.ndarray]:
     """Add the trials of what changes the opposite, which need no simulation.
 
+    Of the sizes that a law lists, which are small. One that stands alone is extrapolated either
+    way, and suggested ones have the right sign.
+
     Args:
         problem: What is screened.
         rows: One a trial.
@@ -115,11 +118,11 @@ def with_opposites(
     simulator, of = problem.simulator, []
     more, others = list(rows), list(trials)
     for index, (row, trial) in enumerate(zip(rows, trials, strict=True)):
-        names = columns_of(simulator.slots, trial.effect)
+        law, names = simulator.effects[trial.effect], columns_of(simulator.slots, trial.effect)
         given = {name: trial.start[j] for name, j in names.items() if j in trial.start}
-        if given not in problem.starts(trial.effect):  # more or less of what acts already
+        if trial.is_only or given not in law.starts(simulator.host, law.target):
             continue
-        opposite = simulator.effects[trial.effect].opposite(given)
+        opposite = law.opposite(given)
         if opposite is not None:
             start = {names[name]: value for name, value in opposite.items()}
             others.append(trial._replace(start=start, rows=(len(more),)))

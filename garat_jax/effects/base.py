@@ -234,9 +234,10 @@ class Effect(abc.ABC):
 
     @classmethod
     def opposite(cls, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Return what changes predictions by the negative of a small one of `starts`, if anything.
+        """Return what changes predictions by the negative of one of `starts`, if anything does.
 
-        It is tried without being simulated.
+        It has the same parameters, and is tried without being simulated. Sizes that are small do
+        for that, several of them: one that stands alone is tried both ways.
         """
         del start
         return None

@@ -28,11 +28,9 @@ SMOOTH = 3
 CLEAR = 0.1
 """Torque that a line rises by over the position's spread, relative to the torques' median distance
 from theirs, below which it is lost among them."""
-SLOW = (0.5, 2.0)
-"""Periods in the range of the angle between which a ripple is slow: fewer are a line, more stand
+SLOW = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)
+"""Periods in the range of the angle that are tried for a slow ripple: fewer are a line, more stand
 out of the spectrum."""
-STEP = 0.25
-"""Periods in the range of the angle by which those differ that are tried for a slow ripple."""
 FEWEST = 20
 """Samples from which a slow ripple is told."""
 PEAKS = 2
@@ -256,7 +254,7 @@ class CoggingTorque(Effect):
     @classmethod
     def opposite(cls, start: Mapping[str, float]) -> Mapping[str, float] | None:
         """Return the ripple half a period late."""
-        return {**start, "phase": start["phase"] - np.copysign(np.pi, start["phase"])}
+        return {**start, "phase": start["phase"] - np.pi}
 
     @classmethod
     def suggested(
@@ -271,16 +269,16 @@ class CoggingTorque(Effect):
         del torque
         span = float(np.ptp(position))
         amplitude, periods, _ = cls.parameters()
-        slow, fast = (max(periods.low, n * 2 * np.pi / max(span, 1e-9)) for n in SLOW)
-        if slow >= periods.high:
+        low, high = max(periods.low, 2 * np.pi * SLOW[-1] / max(span, 1e-9)), periods.high
+        if low >= high:
             return None
         starts = []
         for rest in rests:
             counts = np.isfinite(rest)
             angle, rest = position[counts], rest[counts]
-            slowest = _slow_ripple(angle, rest, slow, min(fast, periods.high))
+            slowest = _slow_ripple(angle, rest)
             for _ in range(PEAKS):
-                peak = _highest_peak(angle, rest, fast, periods.high)
+                peak = _highest_peak(angle, rest, low, high)
                 if peak is None:
                     break
                 size, phase, _ = _wave(peak, angle, rest, SMOOTH)
@@ -290,8 +288,8 @@ class CoggingTorque(Effect):
         starts = [
             {**start, "amplitude": min(start["amplitude"], amplitude.high)} for start in starts
         ]
-        num_tried = len(rests) * math.ceil((periods.high - slow) * span / (2 * np.pi))
-        return Suggestion(tuple(starts), num_tried)
+        num_tried = math.ceil((high - low) * span / (2 * np.pi)) + len(SLOW)
+        return Suggestion(tuple(starts), len(rests) * num_tried)
 
     def apply(self, model: ModelView, state, ctrl: jax.Array, memory):
         """Add the torque at the present angle."""
@@ -322,15 +320,17 @@ def _highest_peak(position: np.ndarray, torque: np.ndarray, low: float, high: fl
     return float(best.x)
 
 
-def _slow_ripple(position: np.ndarray, torque: np.ndarray, low: float, high: float):
-    """Return the ripple in a band, in periods a turn, that explains most beside a line, if any.
+def _slow_ripple(position: np.ndarray, torque: np.ndarray) -> list[dict[str, float]]:
+    """Return the slow ripple that explains most of a torque beside a line, if there is any.
 
     A polynomial that follows more than a line would do much of what it does.
     """
-    span = float(np.ptp(position))
-    if low >= high or len(position) < FEWEST or not span:
+    _, p, _ = CoggingTorque.parameters()
+    turns = float(np.ptp(position)) / (2 * np.pi)
+    grid = np.asarray(SLOW) / max(turns, 1e-9)
+    grid = grid[(grid >= p.low) & (grid <= p.high)]
+    if not len(grid) or len(position) < FEWEST:
         return []
-    grid = np.arange(low, high, 2 * np.pi * STEP / span)
     periods = min(grid, key=lambda n: _wave(n, position, torque, 1)[2])
     size, phase, _ = _wave(periods, position, torque, 1)
     return [{"amplitude": size, "periods": float(periods), "phase": phase}]

@@ -56,6 +56,22 @@ def test_a_few_samples_suggest_no_slow_ripple():
     assert all(start["periods"] > 6.0 for start in starts)
 
 
+def test_a_slow_ripple_is_one_in_the_range_in_which_the_torque_is_known():
+    rng = np.random.default_rng(0)
+    angle = np.sin(np.linspace(0, 40, 4000))
+    torque = 0.01 * rng.normal(size=len(angle))
+    rest = np.where(np.abs(angle) < 0.1, torque, np.nan)
+    starts = CoggingTorque.suggested(angle, torque, rest[None]).starts
+    assert max(start["amplitude"] for start in starts) < 0.02
+
+
+def test_no_ripple_is_suggested_beyond_what_the_law_allows():
+    angle = np.sin(np.linspace(0, 40, 4000))
+    torque = 1e3 * np.sin(20 * angle)
+    starts = CoggingTorque.suggested(angle, torque, torque[None]).starts
+    assert max(start["amplitude"] for start in starts) == CoggingTorque.parameters()[0].high
+
+
 def test_a_controller_that_fights_the_ripple_does_not_hide_it():
     def control(time, angle, speed):
         return 50.0 * (0.8 + np.sin(1.5 * time) - angle) - 2.0 * speed

@@ -211,6 +211,16 @@ def test_what_tells_places_and_sizes_is_checked_before_a_diagnosis(mine, method,
     assert said in line
 
 
+def test_an_opposite_has_the_parameters_of_what_it_is_the_opposite_of(mine):
+    rest = "parameter(0.0, unit='rad', low=-3.0, high=3.0, scale=0.1, source='my bench')"
+    more = f"    rest: jax.Array = {rest}\n"
+    opposite = "    @classmethod\n    def opposite(cls, start):\n        return {'rest': 0.1}\n"
+    mine.write_text(f"{MINE}\n{more}\n{opposite}")
+    model = load_model(mine.parent / "pendulum.xml", load_catalogue([mine]))
+    with pytest.raises(UserError, match=r"has other parameters: \{'rest': 0.1\}"):
+        make_candidates(model)
+
+
 @pytest.mark.parametrize(
     ("body", "said"),
     [
