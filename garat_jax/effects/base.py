@@ -234,11 +234,7 @@ class Effect(abc.ABC):
 
     @classmethod
     def opposite(cls, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Return what changes predictions by the negative of one of `starts`, if anything does.
-
-        It has the same parameters, and is tried without being simulated. Sizes that are small do
-        for that, several of them: one that stands alone is tried both ways.
-        """
+        """Return the parameters that do the negative of a small one of several `starts`, if any."""
         del start
         return None
 
