@@ -14,6 +14,7 @@ from garat_jax.diagnosis.findings import Candidate, Named
 from garat_jax.diagnosis.judge import (
     ANOTHER_MAY_HELP,
     NO_CERTAIN_LEAD,
+    PASSING,
     Judged,
     do_the_same,
     held_out_gain,
@@ -35,7 +36,7 @@ AT_ONCE = 4
 LARGE = 0.3
 """Share of what is left that each of these explains, at least: less, and so few do not explain all
 of an error that is far above its floor."""
-TOGETHER = "passes every gate together with "
+TOGETHER = f"{PASSING} together with "
 
 
 class Path(NamedTuple):

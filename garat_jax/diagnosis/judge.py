@@ -176,7 +176,7 @@ def _judge_one(
         fallen = in_turn[contender.score.effect]
         why = _failed_gate(contender.score, share, fallen, lead, stability)
         passing = (
-            f"passes every gate with each recording held out in turn (the error falls by "
+            f"{PASSING} with each recording held out in turn (the error falls by "
             f"{fallen.estimate:.3g}, {fallen.low:.3g} to {fallen.high:.3g}): those held out hardly "
             "show it"
         )
