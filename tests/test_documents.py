@@ -35,8 +35,16 @@ def test_relative_links_lead_somewhere(path):
     text = path.read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
         if "://" not in target:
-            name = target.partition("#")[0]
-            assert not name or (path.parent / name).exists(), f"{path.name}: {target}"
+            name, _, heading = target.partition("#")
+            page = path.parent / name if name else path
+            assert page.exists(), f"{path.name}: {target}"
+            assert not heading or heading in _anchors(page), f"{path.name}: {target}"
+
+
+def _anchors(page: Path) -> set[str]:
+    """Return what GitHub makes of a page's headings, by which links name them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 @pytest.mark.parametrize("number", range(len(SNIPPETS)))

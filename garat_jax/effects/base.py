@@ -234,7 +234,7 @@ class Effect(abc.ABC):
 
     @classmethod
     def opposite(cls, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Return the parameters that do the negative of a small one of several `starts`, if any."""
+        """Return the same parameters, to do the negative of `start`, a small one of several."""
         del start
         return None
 
