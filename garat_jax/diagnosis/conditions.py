@@ -228,10 +228,16 @@ def _fit_together(
     condition = np.repeat(np.arange(len(recordings)), [len(some) for some in recordings])
     selected = [as_effects(model, d.selected) for d in diagnoses]
     kinds = {(e.kind, e.target): e for own in selected for e in own}
+    had = {(e.kind, e.target): e for e in model.effects}
     host = native_model(model.compile(engine="mujoco"))
     grid = grid_for(everything, host)
-    unmoved = [type(e)(target=e.target, **e.at(host, e.target)) for e in kinds.values()]
-    joint = JointSimulator(Simulator(model, unmoved, grid), selected, condition)
+    unmoved = [
+        had[named] if named in had else type(e)(target=e.target, **e.at(host, e.target))
+        for named, e in kinds.items()
+    ]
+    acting = [number for number, named in enumerate(kinds) if named in had]
+    simulator = Simulator(model.without(unmoved), unmoved, grid, acting=acting)
+    joint = JointSimulator(simulator, selected, condition)
     _, segments = choose_horizon(joint, everything, grid)
     fitted = np.ones(len(segments.start), bool)
     problem = Problem(joint, segments, fitted, grid.sample)

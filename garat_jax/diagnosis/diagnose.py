@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from garat_jax.diagnosis.drift import find_drifts
-from garat_jax.diagnosis.findings import Drift
+from garat_jax.diagnosis.findings import Drift, Named
 from garat_jax.diagnosis.held_out import (
     HeldOut,
     measure_held_out,
@@ -31,7 +31,7 @@ from garat_jax.diagnosis.own_effects import everywhere
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Rung, Verdict
-from garat_jax.diagnosis.segments import SHORTEST, grid_for
+from garat_jax.diagnosis.segments import SHORTEST, Grid, grid_for
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -56,14 +56,15 @@ def diagnose(
 ) -> Diagnosis:
     """Find where a model fails and which physical effects it is missing.
 
+    An effect that the model has may be found, too, with another size.
+
     Args:
         model: The model under diagnosis.
         recordings: What was measured.
         holdout: Recordings to prove the result on. Without any, the last quarter of the recordings
             is held out; of a single recording, its last third.
         say: Told what is being done.
-        shared: Effects that act besides the model's own, and of which each may be another here: one
-            that is selected takes its place.
+        shared: Effects that act besides the model's own, or in their place.
     """
     return diagnose_keeping(model, recordings, holdout, say, shared)[0]
 
@@ -82,16 +83,15 @@ def diagnose_keeping(
     started = time.monotonic()
     fitted, held_out, how = split(checked(recordings), checked(holdout, least=0))
     everything = thin((*fitted, *held_out))
-    whole = dataclasses.replace(model, effects=(*model.effects, *shared))
+    whole = model.with_effects(shared)
     world = whole.compile(engine="mujoco")
     host = native_model(world)
-    others = make_candidates(whole)
     grid = grid_for(everything, host)
     say("choosing the horizon")
     plain = Simulator(whole, (), grid)
     horizon, segments = choose_horizon(plain, everything, grid, num_fitted=len(fitted))
     say(say_horizon(everything, horizon))
-    simulator = Simulator(model, (*shared, *others), grid, acting=range(len(shared)))
+    simulator = make_simulator(whole, grid)
     warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
     warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, everything, grid, horizon)
@@ -131,6 +131,7 @@ def diagnose_keeping(
         unseen=unseen(problem, outcome.before, explaining),
         still=is_still(problem.segments),
         left=(),
+        own=tuple(Named(e.kind, e.target) for e in sizable(model.without(shared))),
     )
     is_seen = found.is_left and found.decisive is not found.finer
     left = leftover(problem, outcome.after, everything, host) if is_seen else ()
@@ -208,6 +209,18 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
             if not alone and not any(are_exclusive(effect, present) for present in model.effects):
                 candidates.append(effect)
     return tuple(candidates)
+
+
+def sizable(model: Model) -> tuple[Effect, ...]:
+    """Return the model's own effects that have a size; a law that a table gives has none."""
+    return tuple(e for e in model.effects if not any(getattr(e, name) for name in e.tables))
+
+
+def make_simulator(model: Model, grid: Grid) -> Simulator:
+    """Make the simulator in which any effect may be missing, or one of the model's be another."""
+    own = sizable(model)
+    candidates = (*own, *make_candidates(model))
+    return Simulator(model.without(own), candidates, grid, acting=range(len(own)))
 
 
 def few_segments(problem: Problem) -> tuple[str, ...]:

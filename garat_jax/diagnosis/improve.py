@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import plotly.graph_objects as go
 
 from garat_jax import report
@@ -16,10 +15,10 @@ from garat_jax.diagnosis.conditions import (
     read_all,
     write_cards,
 )
-from garat_jax.diagnosis.diagnose import diagnose, few_segments, make_candidates, split, thin
+from garat_jax.diagnosis.diagnose import diagnose, few_segments, make_simulator, split, thin
 from garat_jax.diagnosis.drift import find_drifts
 from garat_jax.diagnosis.export import copy_model, needed_files
-from garat_jax.diagnosis.findings import Candidate, Drift, Named, apart
+from garat_jax.diagnosis.findings import Candidate, Drift, apart
 from garat_jax.diagnosis.held_out import HeldOut, measure_held_out
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.measurements import Recording
@@ -32,7 +31,6 @@ from garat_jax.diagnosis.report import diagnosis_facts, diagnosis_lead, diagnosi
 from garat_jax.diagnosis.report_conditions import condition_sections
 from garat_jax.diagnosis.results import Diagnosis, Rung, Verdict
 from garat_jax.diagnosis.segments import grid_for
-from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.view import repaired
 from garat_jax.effects.catalogue import Catalogue
@@ -65,7 +63,7 @@ class Improvement:
     @property
     def card(self) -> str:
         """What the model card adds, in words."""
-        added = [str(c.named) for c in self.diagnosis.selected]
+        added = [self.diagnosis.spelled(c.named) for c in self.diagnosis.selected]
         return f"adds {' and '.join(added)}" if added else "is the model as it was"
 
     def __str__(self) -> str:
@@ -147,7 +145,7 @@ def improve(
         if not found.selected:
             break
         current = repaired(current, found.selected)
-    added = tuple(c for found in rounds for c in found.selected)
+    added = tuple({c.named: c for found in rounds for c in found.selected}.values())
     say("measuring the ladder")
     whole = _as_one(model, recordings, holdout, rounds, added)
     if conditions:
@@ -193,8 +191,7 @@ def _ladder(
     fitted, held_out, how = split(recordings, holdout)
     everything = thin((*fitted, *held_out))
     grid = grid_for(everything, model.compile(engine="mujoco").host.model)
-    offered = {Named(e.kind, e.target): e for e in make_candidates(model)}
-    simulator = Simulator(model, [offered[candidate.named] for candidate in added], grid)
+    simulator = make_simulator(model, grid)
     _, segments = choose_horizon(simulator, everything, grid)
     seen = segments.recording < len(fitted)
     problem = Problem(simulator, segments, seen, grid.sample)
@@ -202,9 +199,8 @@ def _ladder(
     if longer := cut_longer(problem, everything, grid, final):
         problem, _ = longer
     seen, segments, metric = problem.fitted, problem.segments, make_metric(problem)
-    owners = np.asarray([slot.effect for slot in simulator.slots])
     fits = [
-        settle(problem, np.where(owners < count, final, simulator.base), segments.start)
+        settle(problem, found_theta(simulator, added[:count]), segments.start)
         for count in range(len(added) + 1)
     ]
     rungs = tuple(

@@ -68,6 +68,16 @@ class Model:
         try_own(self.spec, self.overrides, effects)
         return compile(self.spec, self.overrides, effects, engine)
 
+    def with_effects(self, effects: Sequence[Effect]) -> "Model":
+        """Return the model with more effects, each in the place of one of its kind and target."""
+        return dataclasses.replace(self, effects=(*self.without(effects).effects, *effects))
+
+    def without(self, effects: Sequence[Effect]) -> "Model":
+        """Return the model less what it has of the kinds and at the targets of some effects."""
+        gone = {(effect.kind, effect.target) for effect in effects}
+        kept = (effect for effect in self.effects if (effect.kind, effect.target) not in gone)
+        return dataclasses.replace(self, effects=tuple(kept))
+
     def world(self, task: Task, engine: str = "auto") -> World:
         """Return a task in this model, to train in: with its effects, and its action transformer.
 

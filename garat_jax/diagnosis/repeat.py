@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from garat_jax.diagnosis.diagnose import make_candidates, split, thin
+from garat_jax.diagnosis.diagnose import make_simulator, split, thin
 from garat_jax.diagnosis.findings import Candidate, Named, Repeated, Sighting
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
@@ -138,7 +138,7 @@ def _alone(
     everything = thin((*parts[0], *parts[1]))
     host = native_model(model.compile(engine="mujoco"))
     grid = grid_for(everything, host)
-    simulator = simulator or Simulator(model, make_candidates(model), grid)
+    simulator = simulator or make_simulator(model, grid)
     theta = found_theta(simulator, selected)
     index = _indices(simulator)
     acting = [index[c.named] for c in selected]

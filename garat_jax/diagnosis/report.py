@@ -1,5 +1,6 @@
 """The report of a diagnosis, and of a comparison, for a reader who was not there."""
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -91,7 +92,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
     error, over = diagnosis.decisive, diagnosis.over
     if error.is_too_coarse:
         return error.coarseness
-    names = " and ".join(c.with_alike(label) for c in diagnosis.selected)
+    spell = functools.partial(diagnosis.spelled, spell=label)
+    names = " and ".join(c.with_alike(spell) for c in diagnosis.selected)
     floor = f"noise and the integrator alone make {_percent(error.noise_floor)}"
     if diagnosis.verdict == "adequate":
         return (
@@ -103,11 +105,12 @@ def _verdict(diagnosis: Diagnosis) -> str:
         f"{_percent(error.after)} of the signals' spread; {floor}"
     )
     them = "it" if len(diagnosis.selected) == 1 else "them"
+    lacks = "needs" if any(c.named in diagnosis.own for c in diagnosis.selected) else "lacks"
     if diagnosis.verdict == "missing_effect":
-        return f"The model lacks {names}. With {them}, {fall}{diagnosis.but}."
+        return f"The model {lacks} {names}. With {them}, {fall}{diagnosis.but}."
     if names:
         rest = f"With {them}, {fall}: {diagnosis.rest}."
-        return f"The model lacks {names}, but that is not all. {rest}"
+        return f"The model {lacks} {names}, but that is not all. {rest}"
     if rivals := diagnosis.rivals(label):
         return (
             f"Something is missing, but none of {rivals} explains more than the others for "

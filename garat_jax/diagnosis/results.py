@@ -161,6 +161,9 @@ class Diagnosis:
     which small changes do not grow; None where those fitted are as long. `finer` holds those at a
     finer timestep, where the integrator's error hides much at the model's own; None elsewhere, and
     where nothing was found that could explain the errors.
+
+    `own` names the effects that the model has and that may have another size: one of them that was
+    selected takes the place of the model's.
     """
 
     model: str
@@ -184,12 +187,17 @@ class Diagnosis:
     conditions: Mapping[str, "Diagnosis"] = dataclasses.field(default_factory=dict)
     longest: Errors | None = None
     finer: Errors | None = None
+    own: tuple[Named, ...] = ()
 
     def added(self, rung: Rung) -> str:
         """Say what a rung of the ladder adds, at its final size."""
         if rung.added is None:
             return "the model as it is"
-        return f"+ {rung.added.named} ({rung.added.sizes})"
+        return f"+ {self.spelled(rung.added.named)} ({rung.added.sizes})"
+
+    def spelled(self, named: Named, spell: Callable[[Named], str] = str) -> str:
+        """Spell an effect; of one that the model has, another size was found."""
+        return f"another size of {spell(named)}" if named in self.own else spell(named)
 
     def under(self, condition: str) -> tuple[Candidate, ...]:
         """Return all effects under a condition: the shared ones, some replaced, and its own."""
@@ -234,7 +242,7 @@ class Diagnosis:
                 f"The model is adequate: its held-out error {error.before:.3g} is near the noise "
                 f"floor {floor}{self.blindness}."
             )
-        names = " and ".join(c.with_alike() for c in self.selected)
+        names = " and ".join(c.with_alike(self.spelled) for c in self.selected)
         if self.verdict == "missing_effect":
             return f"Missing: {names}; {fall}{self.but}."
         if names:

@@ -51,6 +51,7 @@ class Simulator:
         effects: The candidate effects; the model's own effects stay as they are.
         slots: The candidate effects' parameters, in the order of `theta`.
         base: `theta` at which no candidate acts but those that did before, [num_parameters].
+        acting: Indices of these.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class Simulator:
         self.base = np.asarray([slot.base for slot in self.slots])
         self._columns = [columns_of(self.slots, i) for i in range(len(candidates))]
         self._owner = np.asarray([slot.effect for slot in self.slots], int)
-        self._always = {*acting}
+        self.acting = {*acting}
         replayed = [effect.as_replayed() for effect in candidates]
         looking = [i for i, e in enumerate(replayed) if e.reads_state or e.notes]
         self._blind = tuple(i for i in range(len(candidates)) if i not in looking)
@@ -228,7 +229,7 @@ class Simulator:
         """Return the effects that act under some row of parameters [.., num_parameters]."""
         rows = tuple(range(thetas.ndim - 1))
         moved = self._owner[np.any(thetas != self.base, axis=rows)].tolist()
-        return tuple(sorted({*moved, *self._always}))
+        return tuple(sorted({*moved, *self.acting}))
 
     def _is_at_once(self, theta: np.ndarray) -> bool:
         return self._any_at_once and {*self._acting(theta[None])} <= {*self._blind}

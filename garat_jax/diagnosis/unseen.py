@@ -37,6 +37,8 @@ def unseen(
 ) -> tuple[Unseen, ...]:
     """List the candidates that would change the signals by less than noise hides.
 
+    Those that act already are none.
+
     Each is tried at its usual sizes (`Effect.starts`), and with each of its parameters if they act
     alone: the one that shows most counts. Initial states are projected out, as where candidates are
     scored. The size from which one would show is extrapolated from there, and doubled until it
@@ -51,7 +53,7 @@ def unseen(
     simulator, theta = problem.simulator, current.theta
     fitted = np.flatnonzero(problem.fitted)
     chosen = fitted[:: max(1, len(fitted) // SCREENED)]
-    rows, trials = firsts(problem, theta, ())
+    rows, trials = firsts(problem, theta, simulator.acting)
     evidence = Evidence(problem, current, chosen)
 
     def size_of(rows: Sequence[Row]) -> np.ndarray:

@@ -55,8 +55,8 @@ def as_effects(model: Model, selected: Sequence[Candidate]) -> tuple[Effect, ...
 
 
 def repaired(model: Model, selected: Sequence[Candidate]) -> Model:
-    """Return a model with the effects that a diagnosis found."""
-    return dataclasses.replace(model, effects=(*model.effects, *as_effects(model, selected)))
+    """Return a model with the effects that a diagnosis found, some in the place of its own."""
+    return model.with_effects(as_effects(model, selected))
 
 
 def look(

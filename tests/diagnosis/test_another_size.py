@@ -1,0 +1,93 @@
+"""An effect that a model has may have another size in new recordings."""
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import pytest
+
+from garat_jax.diagnosis.conditions import diagnose_conditions
+from garat_jax.diagnosis.diagnose import diagnose, sizable
+from garat_jax.diagnosis.findings import Named
+from garat_jax.diagnosis.improve import improve
+from garat_jax.diagnosis.report import diagnosis_lead
+from garat_jax.diagnosis.view import repaired
+from garat_jax.effects import CATALOGUE, CoulombFriction, MotorCurve, ViscousDamping
+from tests.diagnosis.pendulum import MODEL, add_damping, record
+
+FEW = {kind: CATALOGUE[kind] for kind in ("viscous_damping", "coulomb_friction")}
+DAMPING = Named("viscous_damping", "joint/hinge")
+DAMPED = dataclasses.replace(
+    MODEL,
+    catalogue=FEW,
+    effects=(
+        ViscousDamping("joint/hinge", coefficient=0.02),
+        MotorCurve("actuator/motor", table=((0.0, 0.0), (10.0, 10.0))),
+    ),
+)
+
+
+def recordings(size, seeds=range(3)):
+    return [record(functools.partial(add_damping, size=size), seed) for seed in seeds]
+
+
+@pytest.mark.parametrize("size", [0.008, 0.05])
+def test_it_is_found_and_takes_the_place_of_the_models(size):
+    found = diagnose(DAMPED, recordings(size))
+    (damping,) = found.selected
+    assert damping.named == DAMPING
+    assert damping.parameters["coefficient"].estimate == pytest.approx(size, rel=0.05)
+    assert found.verdict == "missing_effect"
+    assert found.own == (DAMPING,)
+    effects = {e.kind: e for e in repaired(DAMPED, found.selected).effects}
+    assert len(effects) == 2
+    assert effects["viscous_damping"].coefficient == damping.parameters["coefficient"].estimate
+    assert effects["motor_curve"].table == ((0.0, 0.0), (10.0, 10.0))
+    assert str(found).startswith(
+        "Missing: another size of viscous_damping at joint/hinge; held-out"
+    )
+    assert "  + another size of viscous_damping at joint/hinge (coefficient 0.0" in str(found)
+    said = "The model needs another size of viscous damping at joint/hinge. With it"
+    assert diagnosis_lead(found).startswith(said)
+
+
+def test_of_the_right_size_it_is_left_alone():
+    found = diagnose(DAMPED, recordings(0.02))
+    assert (found.verdict, found.selected) == ("adequate", ())
+    assert DAMPING not in {Named(u.effect, u.target) for u in found.unseen}
+
+
+def test_a_law_of_a_table_has_no_size():
+    assert [e.kind for e in sizable(DAMPED)] == ["viscous_damping"]
+
+
+def test_improving_a_model_replaces_it_and_adds_what_else_is_missing():
+    def change(spec):
+        add_damping(spec, size=0.05)
+        spec.joint("hinge").frictionloss = 0.1
+
+    done = improve(DAMPED, [record(change, seed) for seed in range(3)])
+    sizes = {e.kind: e for e in done.model.effects}
+    assert sorted(sizes) == ["coulomb_friction", "motor_curve", "viscous_damping"]
+    assert len(done.model.effects) == 3
+    assert sizes["viscous_damping"].coefficient == pytest.approx(0.05, rel=0.1)
+    assert sizes["coulomb_friction"].torque == pytest.approx(0.1, rel=0.1)
+    first, *_, last = done.diagnosis.ladder
+    assert last.error_holdout < 0.3 * first.error_holdout
+    assert "another size of viscous_damping at joint/hinge" in done.card
+
+
+def test_only_the_condition_that_shows_another_size_has_it():
+    found = diagnose_conditions(DAMPED, recordings(0.02), {"warm": recordings(0.008, (3, 4, 5))})
+    assert found.selected == ()
+    (warm,) = found.conditions["warm"].selected
+    assert warm.parameters["coefficient"].estimate == pytest.approx(0.008, rel=0.05)
+
+
+def test_a_model_takes_effects_in_the_place_of_its_own():
+    friction = CoulombFriction("joint/hinge", torque=0.1)
+    more = ViscousDamping("joint/hinge", coefficient=0.03)
+    model = DAMPED.with_effects((more, friction))
+    assert [e.kind for e in model.effects] == ["motor_curve", "viscous_damping", "coulomb_friction"]
+    assert jnp.isclose(model.effects[1].coefficient, 0.03)
+    assert [e.kind for e in model.without((more,)).effects] == ["motor_curve", "coulomb_friction"]
