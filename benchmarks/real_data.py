@@ -91,7 +91,7 @@ def run_case(
         "verdict": result.verdict,
         "selected": selected,
         "error": result.decisive,
-        "angle_of_whole_runs": {
+        "whole_runs": {
             "recordings": [recording.name for recording in shown],
             "unit": "rad",
             "before": angle_error(model, shown),

@@ -233,10 +233,12 @@ def real_data() -> str:
             f"{row['error']['before']:.3g} → {row['error']['after']:.3g}",
             f"{row['error']['noise_floor']:.3g}",
             f"{row['error']['unexplained_share']:.2f}",
+            f"{row['whole_runs']['before']:.2g} → {row['whole_runs']['after']:.2g}",
         )
         for row in result["rows"]
     ]
     columns = ("recordings", "verdict", "missing", "held-out error", "noise floor", "unexplained")
+    columns = (*columns, "whole runs, rad")
     return table(columns, rows) + origin("real_data", result)
 
 
