@@ -218,12 +218,15 @@ def _span(low: float, high: float) -> str:
 def real_data() -> str:
     result = read("real_data")
 
+    def said(found: dict[str, Any]) -> str:
+        name, size = next((k, v) for k, v in found.items() if isinstance(v, dict))
+        alike = found["indistinguishable_from"]
+        others = alike if len(alike) < 3 else [f"one of {len(alike)} others"]
+        sized = f"{found['effect']} at {found['target']}, {name} {size['estimate']:.3g}"
+        return " or ".join((f"{sized} {size['unit']}", *others))
+
     def named(row: dict[str, Any]) -> str:
-        found = (
-            " or ".join((f"{c['effect']} at {c['target']}", *c["indistinguishable_from"]))
-            for c in row["selected"]
-        )
-        return "; ".join(found) or "–"
+        return "; ".join(said(found) for found in row["selected"]) or "–"
 
     rows = [
         (
