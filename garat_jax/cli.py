@@ -206,7 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 command.run()
     except KeyboardInterrupt as stop:
         stays = isinstance(stop, EarlierRunStays)
-        news = f"interrupted; {stop}" if stays else "interrupted"
+        news = f"interrupted; {stop}" if str(stop) else "interrupted"
         go_on = how_to_go_on(arguments, COMMANDS, begun=not stays)
         return complain(f"{news}; {go_on}", INTERRUPTED)
     except DivergedError as error:

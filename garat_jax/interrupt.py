@@ -6,9 +6,11 @@ Python raises KeyboardInterrupt wherever the main thread happens to be. While XL
 that may be in a Python function which C entered (host_call.py): what is raised at its first line
 never reaches the caller, which goes on with a result that was not written, and raised at its last
 line it leaves C's memory in disorder. There Ctrl-C is held until the function can say so itself.
+What is raised in the garbage collector's callbacks, of which JAX has one, Python drops.
 """
 
 import contextlib
+import gc
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -31,7 +33,7 @@ def entered_from_c(function: Function) -> Function:
 
 
 def raise_held() -> None:
-    """Raise KeyboardInterrupt if Ctrl-C came within a function that C entered."""
+    """Raise KeyboardInterrupt if Ctrl-C came and did not end the block."""
     if _held.is_set():
         raise KeyboardInterrupt
 
@@ -70,11 +72,12 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or hold it within a function that C entered."""
+    """Raise KeyboardInterrupt, but within a function that C entered; hold it for `raise_held`."""
     del number
+    _held.set()
+    collecting = {getattr(callback, "__code__", None) for callback in gc.callbacks}
     while frame is not None:
-        if frame.f_code in _entered_from_c:
-            _held.set()
+        if frame.f_code in _entered_from_c or frame.f_code in collecting:
             return
         frame = frame.f_back
     raise KeyboardInterrupt

@@ -8,14 +8,13 @@ logged step), and whatever the command adds to it: summaries, checkpoints, plots
 import contextlib
 import dataclasses
 import json
-import os
 import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from garat_jax.errors import EarlierRunStays, UserError
+from garat_jax.errors import UserError
 from garat_jax.files import write_whole
 from garat_jax.plain import finite_or_null, to_plain
 from garat_jax.provenance import provenance, versions
@@ -27,6 +26,8 @@ SECONDS = "seconds.json"
 """How long the run has taken so far."""
 CONTENTS = ".contents"
 """Names at the top of the folder that the run has written, a line each: others are the user's."""
+FILES = ".files"
+"""Every file of the run at its end, a line each: others came later and are the user's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +64,8 @@ class RunDirectory:
             command: The command line that started the run.
             seeds: The seeds of the run.
             force: Replace the folder if it holds an earlier run and nothing that the run did not
-                write; hidden files and what lies in its folders are not looked at.
+                write. Hidden files are not looked at, and what lies in its folders only if the run
+                has noted its files.
             resume: Go on with the run that the folder holds; start one if it is absent or empty.
                 None if the command cannot go on with a run.
 
@@ -79,11 +81,12 @@ class RunDirectory:
         root = Path(path)
         line = command if isinstance(command, str) else shlex.join(command)
         record = {"config": finite_or_null(to_plain(config)), "seeds": to_plain(list(seeds))}
-        if _is_occupied(root):
+        if is_occupied(root):
             if resume:
                 _check_same_run(root, line, record)
+                (root / FILES).unlink(missing_ok=True)  # there will be more
                 return cls(root, resumed=True)
-            _check_replaceable(root)
+            check_replaceable(root)
             if not force:
                 go_on = "" if resume is None else "--resume to go on, "
                 raise UserError(
@@ -142,11 +145,16 @@ class RunDirectory:
 
         What was made for it to lie in goes with it, if nothing else lies there by now.
         """
-        if not self.resumed and not _holds_results(self.root):
+        if not self.resumed and not holds_results(self.root):
             shutil.rmtree(self.root)
             with contextlib.suppress(OSError):
                 for folder in self.made:
                     folder.rmdir()
+
+    def note_files(self) -> None:
+        """Write down which files the run has left, at its end."""
+        if self.root.is_dir():
+            write_whole(self.root / FILES, "".join(f"{name}\n" for name in _files(self.root)))
 
     def path(self, name: str) -> Path:
         """Return the path of a file in the run, and make the folder that it belongs to."""
@@ -239,90 +247,40 @@ def _parsed(text: str, path: Path) -> Any:
         raise UserError(f"{path} is damaged ({error}); start anew with --force") from error
 
 
-@contextlib.contextmanager
-def earlier_run_kept(root: Path) -> Iterator[None]:
-    """Keep the run that a folder holds until another one has results in its place.
-
-    Where the block leaves the folder without results, because the input was wrong, the earlier run
-    is put back.
-
-    Args:
-        root: The folder that a run with `force` will replace.
-
-    Raises:
-        EarlierRunStays: Ctrl-C came before there were results.
-        UserError: The folder holds something else than a run, or the current folder is within it.
-    """
-    root = Path(os.path.abspath(root))  # `.` has no name
-    aside = _aside(root)
-    if not _is_occupied(root):
-        yield
-        return
-    _check_replaceable(root)
-    root.rename(aside)
-    try:
-        yield
-    except KeyboardInterrupt:
-        if _holds_results(root):
-            raise
-        raise EarlierRunStays(f"the earlier run stays in {root}") from None
-    finally:
-        if _holds_results(root):
-            shutil.rmtree(aside, ignore_errors=True)
-        else:
-            shutil.rmtree(root, ignore_errors=True)
-            aside.rename(root)
+def not_of_run(root: Path) -> list[str]:
+    """List what a folder holds beside the run in it; nothing where that has noted nothing."""
+    for noted, present in ((FILES, _files(root)), (CONTENTS, _names(root))):
+        if (root / noted).exists():
+            written = (root / noted).read_text(encoding="utf-8").splitlines()
+            return sorted(present.difference(written))
+    return []
 
 
-def put_back_earlier(root: Path) -> bool:
-    """Do what a process that was killed could not: put the run back that it was to replace.
-
-    Where it had results, the run that they replaced goes.
-
-    Args:
-        root: The folder of the run.
-
-    Returns:
-        Whether a run was put back.
-
-    Raises:
-        UserError: Something of the user's lies there now.
-    """
-    root = Path(os.path.abspath(root))
-    aside = _aside(root)
-    if not aside.is_dir():
-        return False
-    contents = root / CONTENTS
-    written = contents.read_text(encoding="utf-8").splitlines() if contents.exists() else [CONFIG]
-    others = {path.name for path in root.glob("[!.]*")}.difference(written)
-    if others or root.is_symlink() or Path.cwd().resolve().is_relative_to(root.resolve()):
-        raise UserError(
-            f"{aside} holds the run that was to be replaced by one that was killed, in {root}, "
-            "where there is something else now, so both are left alone; move one of them away"
-        )
-    if _holds_results(root):
-        shutil.rmtree(aside)
-        return False
-    shutil.rmtree(root, ignore_errors=True)
-    aside.rename(root)
-    return True
+def _names(root: Path) -> set[str]:
+    return {path.name for path in root.glob("[!.]*")}
 
 
-def _aside(root: Path) -> Path:
-    """Return where a run is until another one has results in its place."""
-    return root.parent / f".{root.name}.replaced"
+def _files(root: Path) -> set[str]:
+    """Return the paths of a folder's files, none of them hidden or in a hidden folder."""
+    names = (path.relative_to(root) for path in root.rglob("*") if path.is_file())
+    return {name.as_posix() for name in names if not any(p.startswith(".") for p in name.parts)}
 
 
-def _holds_results(root: Path) -> bool:
+def holds_results(root: Path) -> bool:
     """Say whether there is more in a run directory than how it was begun, and hidden files."""
     begun = (root / CONFIG, root / SECONDS)
     return any(path.is_file() and path not in begun for path in root.rglob("[!.]*"))
 
 
-def _is_occupied(root: Path) -> bool:
+def is_occupied(root: Path) -> bool:
+    """Say whether a folder is there and holds anything.
+
+    Raises:
+        UserError: It is a file.
+    """
     if root.exists() and not root.is_dir():
         raise UserError(f"{root} is a file; expected a folder for the run")
-    return root.is_dir() and any(path.name != CONTENTS for path in root.iterdir())
+    return root.is_dir() and any(path.name not in (CONTENTS, FILES) for path in root.iterdir())
 
 
 def _check_same_run(root: Path, command: str, record: Mapping[str, Any]) -> None:
@@ -356,22 +314,24 @@ def _leaves(record: Any, name: str) -> dict[str, Any]:
     return flat
 
 
-def _check_replaceable(root: Path) -> None:
-    """Refuse to touch what is not recognisably an earlier run."""
+def check_replaceable(root: Path) -> None:
+    """Refuse to touch what is not recognisably an earlier run.
+
+    Raises:
+        UserError: It is none, holds more than that, or the current folder is within it.
+    """
     if not is_run(root) or root.is_symlink():
         raise UserError(
             f"{root} is not empty and holds no run, so it is left alone; give another --out"
         )
-    contents, names = root / CONTENTS, {path.name for path in root.glob("[!.]*")}
-    written = contents.read_text(encoding="utf-8").splitlines() if contents.exists() else names
-    if others := sorted(names.difference(written)):
+    if others := not_of_run(root):
         raise UserError(
             f"{root} holds {', '.join(others)}, which the run in it did not write, so it is left "
             "alone; move that away or give another --out"
         )
     for part in root.iterdir():
         if is_run(part):
-            _check_replaceable(part)
+            check_replaceable(part)
     if Path.cwd().resolve().is_relative_to(root.resolve()):
         raise UserError(
             f"{root} is the current folder or holds it, so it is left alone; "

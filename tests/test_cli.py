@@ -9,8 +9,9 @@ import pytest
 from garat_jax import cli
 from garat_jax.commandline import how_to_go_on, parse
 from garat_jax.commands.checks import make_run, writing
+from garat_jax.earlier_run import earlier_run_kept
 from garat_jax.errors import DivergedError, UserError, nearest, unknown_name
-from garat_jax.runs import RunDirectory, earlier_run_kept
+from garat_jax.runs import RunDirectory
 from garat_jax.terminal import print_table, say
 from tests.test_split import free_port
 

@@ -1,3 +1,5 @@
+import contextlib
+import gc
 import os
 import signal
 
@@ -104,3 +106,21 @@ def test_an_interrupt_that_a_callback_held_ends_the_block():
 
     with pytest.raises(KeyboardInterrupt), interruptible():
         callback()
+
+
+def test_an_interrupt_within_the_collectors_callbacks_ends_the_block():
+    def callback(phase, info):
+        press()
+
+    gc.callbacks.append(callback)
+    try:
+        with pytest.raises(KeyboardInterrupt), interruptible():
+            gc.collect()
+    finally:
+        gc.callbacks.remove(callback)
+
+
+def test_an_interrupt_that_was_lost_ends_the_block():
+    with pytest.raises(KeyboardInterrupt), interruptible(), contextlib.suppress(BaseException):
+        press()
+    raise_held()  # nothing is held any more

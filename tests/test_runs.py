@@ -9,7 +9,7 @@ import pytest
 from garat_jax.errors import UserError
 from garat_jax.plain import to_plain
 from garat_jax.provenance import git_state, provenance
-from garat_jax.runs import RunDirectory, earlier_run_kept, put_back_earlier
+from garat_jax.runs import RunDirectory, check_replaceable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,90 +52,6 @@ def test_a_folder_that_is_not_empty_is_refused_in_one_line(tmp_path):
     assert "\n" not in str(refusal.value)
 
 
-def test_an_earlier_run_stays_where_the_next_one_has_no_results(tmp_path):
-    create(tmp_path / "run").log(1, loss=1.0)
-    with pytest.raises(UserError, match="wrong input"), earlier_run_kept(tmp_path / "run"):
-        create(tmp_path / "run", seeds=[7])
-        raise UserError("wrong input")
-    run = RunDirectory.open(tmp_path / "run")
-    assert run.read_json("config.json")["seeds"] == [0, 1]
-    assert len(list(run.metrics())) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_the_time_that_compiling_took_is_no_result(tmp_path):
-    create(tmp_path / "run").log(1, loss=1.0)
-    with pytest.raises(UserError), earlier_run_kept(tmp_path / "run"):
-        create(tmp_path / "run", seeds=[7]).write_json("seconds.json", {"compile": 20.0})
-        raise UserError("wrong input")
-    assert RunDirectory.open(tmp_path / "run").read_json("config.json")["seeds"] == [0, 1]
-
-
-def test_an_earlier_run_goes_where_the_next_one_has_results(tmp_path):
-    create(tmp_path / "run").log(1, loss=1.0)
-    with earlier_run_kept(tmp_path / "run"):
-        create(tmp_path / "run", seeds=[7]).log(2, loss=3.0)
-    run = RunDirectory.open(tmp_path / "run")
-    assert run.read_json("config.json")["seeds"] == [7]
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_the_current_folder_may_be_named_by_a_dot(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with earlier_run_kept(Path()):
-        create(Path()).log(1, loss=1.0)
-    with pytest.raises(UserError, match="current folder"), earlier_run_kept(Path()):
-        raise AssertionError
-    assert len(list(RunDirectory.open(tmp_path).metrics())) == 1
-
-
-def test_an_earlier_run_that_a_killed_process_put_aside_comes_back(tmp_path):
-    create(tmp_path / ".run.replaced").log(1, loss=1.0)
-    put_back_earlier(tmp_path / "run")
-    assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_an_earlier_run_comes_back_where_a_killed_process_had_no_results(tmp_path):
-    create(tmp_path / ".run.replaced").log(1, loss=1.0)
-    create(tmp_path / "run", seeds=[7])
-    put_back_earlier(tmp_path / "run")
-    assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_an_earlier_run_goes_where_a_killed_process_had_results(tmp_path):
-    create(tmp_path / ".run.replaced").log(1, loss=1.0)
-    create(tmp_path / "run", seeds=[7]).log(2, loss=3.0)
-    put_back_earlier(tmp_path / "run")
-    run = RunDirectory.open(tmp_path / "run")
-    assert run.read_json("config.json")["seeds"] == [7]
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-@pytest.mark.parametrize("is_begun", [False, True])
-def test_what_a_killed_process_left_beside_other_files_stays(tmp_path, is_begun):
-    create(tmp_path / ".run.replaced").log(1, loss=1.0)
-    if is_begun:
-        create(tmp_path / "run")
-    (tmp_path / "run").mkdir(exist_ok=True)
-    (tmp_path / "run" / "thesis.tex").write_text("years of work")
-    with pytest.raises(UserError, match=r"run\.replaced holds the run that was to be replaced"):
-        put_back_earlier(tmp_path / "run")
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".run.replaced", "run"]
-    assert (tmp_path / "run" / "thesis.tex").exists()
-
-
-def test_a_file_that_a_killed_process_had_not_finished_is_no_result(tmp_path):
-    create(tmp_path / ".run.replaced").log(1, loss=1.0)
-    run = create(tmp_path / "run", seeds=[7])
-    run.path("stages/one.json")
-    run.write_json("seconds.json", {"compile": 20.0})  # of the first program
-    (tmp_path / "run" / ".123.seconds.json").write_text("{")
-    assert put_back_earlier(tmp_path / "run")
-    assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1
-
-
 def test_force_replaces_a_run(tmp_path):
     create(tmp_path).log(1, loss=1.0)
     run = create(tmp_path, seeds=[7], force=True)
@@ -160,8 +76,8 @@ def test_force_leaves_a_run_alone_to_which_a_user_has_added_a_file(tmp_path):
     message = r"holds thesis\.tex, which the run in it did not write"
     with pytest.raises(UserError, match=message):
         create(tmp_path, force=True)
-    with pytest.raises(UserError, match=message), earlier_run_kept(tmp_path):
-        pass
+    with pytest.raises(UserError, match=message):
+        check_replaceable(tmp_path)
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
     assert len(list(run.metrics())) == 1
 
@@ -173,6 +89,25 @@ def test_force_leaves_alone_what_a_user_has_added_to_a_run_within_a_run(tmp_path
     (inner.root / "thesis.tex").write_text("years of work")
     with pytest.raises(UserError, match=r"part holds thesis\.tex"):
         create(tmp_path, force=True)
+
+
+def test_force_leaves_a_run_alone_to_whose_folders_a_user_has_added_a_file(tmp_path):
+    run = create(tmp_path)
+    run.path("data/one.csv").write_text("")
+    run.note_files()
+    create(tmp_path, force=True).path("data/one.csv").write_text("")
+    run.note_files()
+    (tmp_path / "data" / "mine.csv").write_text("years of work")
+    with pytest.raises(UserError, match=r"holds data/mine\.csv, which the run in it did not write"):
+        create(tmp_path, force=True)
+    assert (tmp_path / "data" / "mine.csv").exists()
+
+
+def test_a_run_that_goes_on_may_write_more_files(tmp_path):
+    create(tmp_path).note_files()
+    create(tmp_path, resume=True).path("data/one.csv").write_text("")
+    create(tmp_path, force=True)
+    assert not (tmp_path / "data").exists()
 
 
 def test_a_run_that_did_not_note_what_it_wrote_is_replaced_as_a_whole(tmp_path):

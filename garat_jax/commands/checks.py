@@ -39,7 +39,8 @@ def make_run(
     Raises:
         UserError: A seed is out of range, or the folder may not be written.
     """
-    from garat_jax.runs import RunDirectory, earlier_run_kept, put_back_earlier
+    from garat_jax.earlier_run import earlier_run_kept, forget_earlier, put_back_earlier
+    from garat_jax.runs import RunDirectory
 
     for seed in (*seeds[:1], *seeds[-1:]):
         if not 0 <= seed <= LARGEST_SEED:
@@ -51,8 +52,8 @@ def make_run(
     }
     line = shlex.join([PROGRAM, *sys.argv[1:]])
     replaces = command.force and not resume
-    if (command.force or resume) and put_back_earlier(out):
-        complain(f"put the run back in {out} that one which was killed was to replace", 0)
+    if (command.force or resume) and put_back_earlier(out, bool(resume)):
+        complain(f"put the run back in {out} that one which did not end was to replace", 0)
     if replaces:
         _check_outside(command, out)
     with earlier_run_kept(out) if replaces else contextlib.nullcontext():
@@ -67,6 +68,10 @@ def make_run(
         except (UserError, RuntimeError):
             run.discard()
             raise
+        finally:
+            run.note_files()
+    if resume:
+        forget_earlier(out)
 
 
 def _check_outside(command: Any, out: Path) -> None:
