@@ -27,11 +27,12 @@ from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.noise import signal_noise
 from garat_jax.diagnosis.own_effects import everywhere
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
 from garat_jax.diagnosis.results import Candidate, Diagnosis, Rung, Verdict
-from garat_jax.diagnosis.segments import SHORTEST, Grid, grid_for
+from garat_jax.diagnosis.segments import QUIET, SHORTEST, Grid, grid_for
 from garat_jax.diagnosis.separate import next_experiment
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -82,6 +83,7 @@ def diagnose_keeping(
     """
     started = time.monotonic()
     fitted, held_out, how = split(checked(recordings), checked(holdout, least=0))
+    check_motion(fitted, held_out)
     everything = thin((*fitted, *held_out))
     whole = model.with_effects(shared)
     world = whole.compile(engine="mujoco")
@@ -161,6 +163,36 @@ def split(
     first = dataclasses.replace(whole, spans=before)
     last = dataclasses.replace(whole, name=f"{whole.name} (last third)", spans=after)
     return (first,), (last,), "on the last third of the only recording"
+
+
+def check_motion(fitted: Sequence[Recording], held_out: Sequence[Recording]) -> None:
+    """Refuse recordings of which either part moves alone: nothing is found or proved on the other.
+
+    Raises:
+        UserError: No command of the other changes, and no signal by more than `QUIET` times its
+            noise.
+    """
+    parts = (fitted, "to fit", "found"), (held_out, "held out", "proved")
+    still = [part for part in parts if not any(map(_moves, part[0]))]
+    if len(still) == 1:
+        ((recordings, what, why),) = still
+        names = ", ".join(recording.name for recording in recordings)
+        raise UserError(
+            f"nothing moves in {names} ({what}): no command changes, and no signal by more than "
+            f"{QUIET:g} times its noise, so that nothing can be {why} there; record motion, or "
+            "hold out others"
+        )
+
+
+def _moves(recording: Recording) -> bool:
+    num = recording.qpos.shape[1] + recording.velocity_measured * recording.qvel.shape[1]
+    state = np.concatenate([recording.qpos, recording.qvel], axis=1)[:, :num]
+    kept, ctrl = (
+        np.concatenate([of_all[a:b] for a, b in recording.spans])
+        for of_all in (state, recording.ctrl)
+    )
+    moves = np.any(kept.std(axis=0) > QUIET * signal_noise(recording)[:num])
+    return bool(moves or np.any(np.ptp(ctrl, axis=0) > 0))
 
 
 def _long_enough(spans: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:

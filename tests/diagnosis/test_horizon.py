@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis.diagnose import diagnose
+from garat_jax.diagnosis.conditions import diagnose_conditions
+from garat_jax.diagnosis.diagnose import check_motion, diagnose
 from garat_jax.diagnosis.held_out import longest_errors
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer, cut_longest
 from garat_jax.diagnosis.measurements import Recording
@@ -184,15 +185,31 @@ def test_what_recordings_held_out_show_in_longer_segments_alone_is_found():
 
 def test_a_gap_that_recordings_held_out_never_show_is_a_warning():
     model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
-    *recordings, last = (record(weaken, seed) for seed in range(4))
-    still = dataclasses.replace(last, qpos=0 * last.qpos, qvel=0 * last.qvel, ctrl=0 * last.ctrl)
-    rng = np.random.default_rng(0)
-    noise = rng.normal(size=(len(last.time), 2)) * [1e-3, 1e-2]
-    still = dataclasses.replace(still, qpos=noise[:, :1], qvel=noise[:, 1:])
-    found = diagnose(model, recordings, [still])
+    recordings = [record(weaken, seed) for seed in range(3)]
+    free = record(weaken, 3, control=lambda time, angle, speed: 0.0)
+    found = diagnose(model, recordings, [free])
     assert found.verdict == "adequate"
     assert "it does not predict qpos.hinge and qvel.hinge of the others" in " ".join(found.warnings)
-    assert not diagnose(model, [still, still], [still]).warnings
+
+
+def test_nothing_is_found_in_or_proved_on_recordings_in_which_nothing_moves():
+    model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
+    moves = record(weaken, 0)
+    stuck = dataclasses.replace(moves, qpos=0 * moves.qpos, qvel=0 * moves.qvel, name="rest")
+    still = dataclasses.replace(stuck, ctrl=0 * moves.ctrl)
+    noise = np.random.default_rng(0).normal(size=(len(still.time), 2)) * [1e-3, 1e-2]
+    noisy = dataclasses.replace(still, qpos=noise[:, :1], qvel=noise[:, 1:], name="quiet")
+    with pytest.raises(
+        UserError, match=r"^nothing moves in rest, quiet \(to fit\): .* found"
+    ):
+        diagnose(model, [still, noisy], [moves])
+    with pytest.raises(UserError, match=r"^nothing moves in quiet \(held out\): .* proved there"):
+        diagnose(model, [moves], [noisy])
+    check_motion([stuck], [moves])  # what commands do not move tells of friction
+    with pytest.raises(UserError, match="under the condition warm: nothing moves in quiet"):
+        diagnose_conditions(model, [moves], {"warm": [noisy, moves]})
+    alike = diagnose(model, [noisy, noisy], [noisy])
+    assert (alike.verdict, alike.still, alike.warnings) == ("adequate", True, ())
 
 
 SERVO = """
