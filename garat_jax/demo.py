@@ -52,9 +52,11 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
     hidden = make_recordings(PENDULUM, run.path("measurements"), seed)
     part = _part(run, "diagnosis", {"model": PENDULUM}, [seed], force=run.resumed)
     found, pages = run_diagnose(PENDULUM, hidden.fit, hidden.holdout, part)
+    truth = _truth(found, hidden)
+    say(truth.text)
     sections = [
         *_titled("Transfer", summary.sections(transfer, PAIRS[PAIR].summary)),
-        *_titled("Hidden effect", [*pages, _truth(found, hidden)]),
+        *_titled("Hidden effect", [truth, *pages]),
     ]
     if real is not None:
         console.rule("3. Real measurements: a pendulum that swings freely")
@@ -99,6 +101,8 @@ def _truth(found: Diagnosis, hidden: Hidden) -> Section:
 
 def _facts(transfer: Mapping[str, Any], found: Diagnosis) -> list[Fact]:
     method, more, *_ = summary.facts(transfer)
-    fall = f"{found.error.before:.2g} → {found.error.after:.2g}"
-    label = f"held-out error; noise floor {found.error.noise_floor:.2g}"
-    return [method, more, Fact(fall, label)]
+    before, after, floor = (
+        f"{100 * error:.2g} %"
+        for error in (found.error.before, found.error.after, found.error.noise_floor)
+    )
+    return [method, more, Fact(f"{before} → {after}", f"held-out error; noise makes {floor}")]

@@ -55,8 +55,8 @@ def parse_source(text: str) -> Source:
     match = _SOURCE.fullmatch(text)
     if match is None:
         raise UserError(
-            f"{text!r} names no field of a topic; expected /TOPIC.FIELD, /TOPIC.FIELD[0] or "
-            "/TOPIC.FIELD[JOINT]"
+            f"{text!r} in the map names no field of a topic; expected /TOPIC.FIELD, "
+            "/TOPIC.FIELD[0] or /TOPIC.FIELD[JOINT]"
         )
     return Source(match["topic"], match["field"], match["element"])
 
@@ -81,8 +81,8 @@ def read_bag(path: Path, sources: Sequence[str], clock: str) -> dict[str, Series
         raise UserError(
             f"{path}: bags need the package rosbags; install it with: pip install 'garat_jax[logs]'"
         ) from error
-    wanted = {text: parse_source(text) for text in sources}
     try:
+        wanted = {text: parse_source(text) for text in sources}
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             found = _rows(reader, wanted, clock)
     except UserError as error:

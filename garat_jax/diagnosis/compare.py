@@ -13,6 +13,7 @@ import plotly.graph_objects as go
 from garat_jax import report
 from garat_jax.diagnosis import figures
 from garat_jax.diagnosis.diagnose import thin
+from garat_jax.diagnosis.held_out import metric_in_words
 from garat_jax.diagnosis.horizon import (
     choose_horizon,
     say_horizon,
@@ -283,8 +284,7 @@ def _errors(played: Replay, simulator: Simulator, grid: Grid) -> Errors:
     return Errors.above(
         floor.error,
         metric.of_noise(~nothing),
-        metric="root mean square of prediction error by signal's standard deviation, all "
-        f"recordings, segments of {played.horizon:g} s",
+        metric=metric_in_words(problem, "on all recordings"),
         horizon=played.horizon,
         before=played.error(),
         after=played.error(),

@@ -266,26 +266,23 @@ def run_improve(
 
 def _rounds_section(rounds: Sequence[Diagnosis]) -> Section:
     """Show what each diagnosis found in the model as the one before had left it."""
-    columns = ["diagnosis", "verdict", "adds", "over [s]", "timestep [s]", "before", "after"]
-    columns += ["noise floor", "unexplained [%]"]
+    columns = ["", "verdict", "adds", "over", "before [%]", "after [%]", "noise [%]", "left [%]"]
     rows = [
         (
             number,
             found.verdict.replace("_", " "),
-            ", ".join(str(c.named) for c in found.selected) or "nothing",
-            error.horizon,
-            error.timestep,
-            error.before,
-            error.after,
-            error.noise_floor,
+            ", ".join(found.spelled(c.named) for c in found.selected) or "nothing",
+            found.over.removeprefix(" over "),
+            *(f"{100 * e:.3g}" for e in (error.before, error.after, error.noise_floor)),
             round(100 * error.unexplained_share),
         )
         for number, (found, error) in enumerate(((r, r.decisive) for r in rounds), 1)
     ]
     text = (
         "Each diagnosis begins with what the ones before it added. A better model predicts for "
-        "longer, so later ones may follow the recordings over longer segments: held-out errors "
-        "compare along a row, not down a column."
+        "longer, so later ones may follow the recordings over longer segments: errors, of what is "
+        "held out, compare along a row, not down a column. What is left is that of the error that "
+        "noise does not explain."
     )
     return Section("Diagnosis after diagnosis", text, tables=[Table(columns, rows)])
 

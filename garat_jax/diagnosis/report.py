@@ -132,9 +132,10 @@ def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     rest = Fact(_percent(error.unexplained_share), "of the error stays unexplained")
     if num := len(error.above_floor if diagnosis.but else diagnosis.loud):
         rest = Fact(str(num), f"{'signal stays' if num == 1 else 'signals stay'} above the noise")
+    after = Fact(_percent(error.after), f"error{over} with the effects that were found")
     return [
         Fact(_percent(error.before), f"error of the model as it is{over}, of each signal's spread"),
-        Fact(_percent(error.after), f"error{over} with the effects that were found"),
+        *([after] if diagnosis.selected else []),
         Fact(_percent(error.noise_floor), "noise floor: what noise and the integrator alone make"),
         rest,
     ]

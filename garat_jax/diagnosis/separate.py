@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import mujoco
 
-from garat_jax.diagnosis.findings import Candidate, Named
+from garat_jax.diagnosis.findings import MOST_NAMED, Candidate, Named
 from garat_jax.diagnosis.results import Experiment
 from garat_jax.effects.contact import partners
 from garat_jax.effects.elements import element_id
@@ -58,16 +58,16 @@ NONE = (
 )
 """Of one kind at two geoms that make one contact."""
 UNKNOWN = (
-    "no experiment is known that tells {first} from {second}; garat plan MODEL --separate "
-    "{first_place} {second_place} --out plan.csv looks for commands that do, and says how far "
+    "no experiment is known that tells {first} from {others}; garat plan MODEL --separate "
+    "{first_place} {other_place} --out plan.csv looks for commands that do, and says how far "
     "they do"
 )
-"""Of other pairs, where there are commands."""
+"""Of others, where there are commands; the first of these stands for all."""
 UNKNOWN_PASSIVE = (
-    "no experiment is known that tells {first} from {second}; recordings from other initial states "
+    "no experiment is known that tells {first} from {others}; recordings from other initial states "
     "and at other amplitudes may"
 )
-"""Of other pairs, where there are none."""
+"""Of others, where there are none."""
 
 
 def next_experiment(candidates: Sequence[Candidate], host: mujoco.MjModel) -> Experiment | None:
@@ -81,22 +81,33 @@ def next_experiment(candidates: Sequence[Candidate], host: mujoco.MjModel) -> Ex
     """
     for candidate in candidates:
         if candidate.indistinguishable_from and math.isfinite(candidate.error_after):
-            others = candidate.indistinguishable_from
-            ways = dict.fromkeys(_way(candidate.named, other, host) for other in others)
-            return Experiment((candidate.named, *others), "; ".join(ways))
+            first, others = candidate.named, candidate.indistinguishable_from
+            known = {other: _way(first, other, host) for other in others}
+            ways = [*dict.fromkeys(way for way in known.values() if way)]
+            if unknown := [other for other, way in known.items() if not way]:
+                ways.append(_advice(first, unknown, host))
+            return Experiment((first, *others), "; ".join(ways))
     return None
 
 
 def _way(first: Named, second: Named, host: mujoco.MjModel) -> str:
-    """Return what separates two effects, or that nothing does, in words."""
+    """Return what separates two effects, or that nothing can, in words; empty if unknown."""
     if known := EXPERIMENTS.get(frozenset({first.effect, second.effect})):
         return known
     if first.effect == second.effect and _make_one_contact(host, first.target, second.target):
         kind = first.effect.replace("_", " ")
         return NONE.format(first=first, other=second.target, kind=kind)
-    places = [f"{named.effect}@{named.target}" for named in (first, second)]
+    return ""
+
+
+def _advice(first: Named, others: Sequence[Named], host: mujoco.MjModel) -> str:
+    """Return what may separate an effect from others of which no experiment is known to."""
+    more = len(others) - MOST_NAMED
+    named = " or ".join(str(other) for other in others[:MOST_NAMED])
+    named += f" or {more} more" if more > 0 else ""
+    places = [f"{one.effect}@{one.target}" for one in (first, others[0])]
     words = UNKNOWN if host.nu else UNKNOWN_PASSIVE
-    return words.format(first=first, second=second, first_place=places[0], second_place=places[1])
+    return words.format(first=first, others=named, first_place=places[0], other_place=places[1])
 
 
 def _make_one_contact(host: mujoco.MjModel, first: str, second: str) -> bool:

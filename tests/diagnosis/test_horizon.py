@@ -199,9 +199,7 @@ def test_nothing_is_found_in_or_proved_on_recordings_in_which_nothing_moves():
     still = dataclasses.replace(stuck, ctrl=0 * moves.ctrl)
     noise = np.random.default_rng(0).normal(size=(len(still.time), 2)) * [1e-3, 1e-2]
     noisy = dataclasses.replace(still, qpos=noise[:, :1], qvel=noise[:, 1:], name="quiet")
-    with pytest.raises(
-        UserError, match=r"^nothing moves in rest, quiet \(to fit\): .* found"
-    ):
+    with pytest.raises(UserError, match=r"^nothing moves in rest, quiet \(to fit\): .* found"):
         diagnose(model, [still, noisy], [moves])
     with pytest.raises(UserError, match=r"^nothing moves in quiet \(held out\): .* proved there"):
         diagnose(model, [moves], [noisy])
