@@ -46,6 +46,7 @@ class Sized(NamedTuple):
         error_before: Error on the recordings, relative to each signal's standard deviation.
         error_after: The same with the effect.
         dead: Parameters that stay at no effect, because they change no signal.
+        unsure: Those within whose interval no effect lies.
     """
 
     effect: Effect
@@ -54,9 +55,13 @@ class Sized(NamedTuple):
     error_before: float
     error_after: float
     dead: tuple[str, ...] = ()
+    unsure: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        sizes = [f"{name} = {said(e)}" for name, e in self.parameters.items()]
+        sizes = [
+            f"{name} = {said(e)}{'; it may as well be no effect' if name in self.unsure else ''}"
+            for name, e in self.parameters.items()
+        ]
         sizes += [
             f"{name} = {getattr(self.effect, name):.4g}: it stays at no effect, the recordings do "
             "not excite it"
@@ -218,13 +223,15 @@ def size(
     fits = [fit(problem, theta, before.start, seen) for theta in starts]
     best = min(fits, key=lambda fitted: float(fitted.cost.sum()))
     best = count_timestep(problem, best)
+    found = estimates(problem, best)
     return Sized(
         effect=simulator.with_parameters([float(v) for v in best.theta], [0])[0],
-        parameters=estimates(problem, best),
+        parameters=found,
         horizon=horizon,
         error_before=metric.error(before.residual, problem.fitted),
         error_after=metric.error(best.residual, problem.fitted),
         dead=tuple(dead),
+        unsure=tuple(name for name, e in found.items() if e.low <= none[name] <= e.high),
     )
 
 

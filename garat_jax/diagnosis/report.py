@@ -337,7 +337,8 @@ def _where(places: Sequence[Place], view: View) -> list[Section]:
             f"The missing torque at {places[0].signal}",
             "The shape of this cloud tells effects apart: a step at zero velocity is dry friction, "
             "a slope is viscous friction, a level is an offset, a slope against the command is a "
-            f"wrong gain, and a slope against the command's change is a delay.{law}",
+            "wrong gain, or a mass where commands make most of the acceleration, and a slope "
+            f"against the command's change is a delay.{law}",
             figures=[
                 Figure(
                     figures.missing_torques(view.missing, view.explained, dof, unit),

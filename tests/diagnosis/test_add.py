@@ -59,8 +59,18 @@ def test_a_fitted_effect_is_recovered_and_said(pendulum, recorded, capsys):
     assert effect.torque == pytest.approx(made.parameters["torque"], rel=0.05)
     printed = capsys.readouterr().out
     assert f"torque = {effect.torque:.4g} N m (95 %: " in printed
+    assert "no effect" not in printed
     before, after = printed.rpartition("spread: ")[2].split()[0:3:2]
     assert float(after) < 0.3 * float(before)
+
+
+def test_a_size_that_may_be_none_is_said(pendulum, recorded, capsys):
+    made, files = recorded
+    friction = ["--at", "joint/hinge", "--set", f"torque={made.parameters['torque']}"]
+    _, card = add(pendulum, "coulomb_friction", *friction)
+    more, fit = ["torque_offset", "--at", "joint/hinge"], ["--fit", *files]
+    assert cli.main(["add", str(card), *more, *fit, "--out", str(card.with_name("two.toml"))]) == 0
+    assert "); it may as well be no effect" in capsys.readouterr().out
 
 
 def test_a_peak_above_a_friction_that_is_given_is_fitted(pendulum, recorded, capsys):

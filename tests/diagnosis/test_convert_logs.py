@@ -229,7 +229,11 @@ def test_a_bag_damaged_after_its_beginning_is_refused(tmp_path, capsys, kept):
             "no message of /joint_states has an element [2] of velocity",
         ),
         ("[hinge]", "", "is no number; name one of its elements"),
-        ("/effort.data", "effort", "'effort' names no field of a topic; expected /TOPIC.FIELD"),
+        (
+            "/effort.data",
+            "effort",
+            "'effort' in the map names no field of a topic",
+        ),
     ],
 )
 def test_refusals_of_bags(tmp_path, capsys, old, new, said):
