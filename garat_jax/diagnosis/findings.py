@@ -43,6 +43,14 @@ class Named:
 
 
 @dataclasses.dataclass(frozen=True)
+class Experiment:
+    """What to record next to tell indistinguishable effects apart."""
+
+    separates: tuple[Named, ...]
+    how: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Unseen(Named):
     """An effect that the recordings cannot show, up to a size.
 

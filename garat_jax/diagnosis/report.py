@@ -102,7 +102,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
         )
     fall = (
         f"the error on recordings held out{over} falls from {_percent(error.before)} to "
-        f"{_percent(error.after)} of the signals' spread; {floor}"
+        f"{_percent(error.after)} of the signals' spread{diagnosis.farther(_percent)}; {floor}"
     )
     them = "it" if len(diagnosis.selected) == 1 else "them"
     lacks = "needs" if any(c.named in diagnosis.own for c in diagnosis.selected) else "lacks"

@@ -12,6 +12,7 @@ from garat_jax.diagnosis.findings import (
     MOST_NAMED,
     Candidate,
     Drift,
+    Experiment,
     Named,
     Repeated,
     Unseen,
@@ -141,14 +142,6 @@ class Errors:
 
 
 @dataclasses.dataclass(frozen=True)
-class Experiment:
-    """What to record next to tell indistinguishable effects apart."""
-
-    separates: tuple[Named, ...]
-    how: str
-
-
-@dataclasses.dataclass(frozen=True)
 class Diagnosis:
     """Where a model fails and which effect it is missing; fields as in diagnosis.json.
 
@@ -236,7 +229,8 @@ class Diagnosis:
         if error.is_too_coarse:
             return error.coarseness
         floor = f"{error.noise_floor:.3g}"
-        fall = f"held-out error{over} {error.before:.3g} → {error.after:.3g}, noise floor {floor}"
+        fall = f"held-out error{over} {error.before:.3g} → {error.after:.3g}{self.farther()}"
+        fall += f", noise floor {floor}"
         if self.verdict == "adequate":
             return (
                 f"The model is adequate: its held-out error {error.before:.3g} is near the noise "
@@ -333,6 +327,13 @@ class Diagnosis:
         error = self.decisive
         at = f" at a timestep of {error.timestep:.2g} s" if error is self.finer else ""
         return f" over {error.horizon:.2g} s{at}" if math.isfinite(error.horizon) else ""
+
+    def farther(self, spell: Callable[[float], str] = "{:.3g}".format) -> str:
+        """Return a clause with the errors over longer segments, where they were measured."""
+        far = self.longest
+        if far is None or far is self.decisive or not self.selected:
+            return ""
+        return f" (over {far.horizon:.2g} s {spell(far.before)} → {spell(far.after)})"
 
     @property
     def is_left(self) -> bool:

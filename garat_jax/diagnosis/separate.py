@@ -5,8 +5,7 @@ from collections.abc import Sequence
 
 import mujoco
 
-from garat_jax.diagnosis.findings import MOST_NAMED, Candidate, Named
-from garat_jax.diagnosis.results import Experiment
+from garat_jax.diagnosis.findings import MOST_NAMED, Candidate, Experiment, Named
 from garat_jax.effects.contact import partners
 from garat_jax.effects.elements import element_id
 

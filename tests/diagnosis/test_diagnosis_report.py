@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis import Diagnosis, Recording, figures, load_model
-from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named, apart
+from garat_jax.diagnosis.findings import Candidate, Estimate, Experiment, Interval, Named, apart
 from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD
 from garat_jax.diagnosis.leftover import leftover
@@ -20,7 +20,7 @@ from garat_jax.diagnosis.report import (
     write_diagnosis,
 )
 from garat_jax.diagnosis.report_data import warnings_section
-from garat_jax.diagnosis.results import Errors, Experiment, Rung
+from garat_jax.diagnosis.results import Errors, Rung
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -146,6 +146,8 @@ def test_long_segments_that_show_no_gap_do_not_decide():
     not_all = dataclasses.replace(NOT_ALL, longest=right)
     assert not_all.decisive is not_all.error
     assert not_all.over == ""
+    assert " (over 2 s 0.9 → 0.09), noise floor 0.01;" in not_all.sentence
+    assert " of the signals' spread (over 2 s 90 % → 9 %); noise" in diagnosis_lead(not_all)
 
 
 def test_a_gap_in_single_signals_is_not_said_to_be_0_percent_of_the_error():
