@@ -6,7 +6,7 @@ import numpy as np
 
 from garat_jax.diagnosis import figures
 from garat_jax.diagnosis.figures import label, was_fitted, words
-from garat_jax.diagnosis.findings import Candidate, Estimate
+from garat_jax.diagnosis.findings import Candidate, Estimate, Named
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.diagnosis.units import after_number
@@ -92,14 +92,22 @@ def parameters_section(diagnosis: Diagnosis, model: Model) -> list[Section]:
     """Return the section of what was added and its sizes; none where nothing was."""
     if not diagnosis.selected:
         return []
+    own = {Named(effect.kind, effect.target): effect for effect in model.effects}
+    replaces = any(c.named in own for c in diagnosis.selected)
+
+    def before(c: Candidate, name: str) -> list[float]:
+        size = float(getattr(own[c.named], name)) if c.named in own else np.nan
+        return [size] if replaces else []
+
     rows = [
-        (label(c), name, e.estimate, e.low, e.high, e.unit)
+        (label(c), name, e.estimate, e.low, e.high, e.unit, *before(c, name))
         for c in diagnosis.selected
         for name, e in c.parameters.items()
     ]
     kinds = dict.fromkeys(c.effect for c in diagnosis.selected)
     laws = "\n".join(f"- {words(kind)}: {model.catalogue[kind].law}" for kind in kinds)
     columns = ["effect", "parameter", "estimate", "low", "high", "unit"]
+    columns += ["in the model as it is"] if replaces else []
     caption = "Estimates and their 95 % intervals; – where the recordings say nothing."
     return [Section("What was added", laws, tables=[Table(columns, rows, caption)])]
 

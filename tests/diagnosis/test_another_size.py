@@ -11,6 +11,7 @@ from garat_jax.diagnosis.diagnose import diagnose, sizable
 from garat_jax.diagnosis.findings import Named
 from garat_jax.diagnosis.improve import improve
 from garat_jax.diagnosis.report import diagnosis_lead
+from garat_jax.diagnosis.report_effects import parameters_section
 from garat_jax.diagnosis.view import repaired
 from garat_jax.effects import CATALOGUE, CoulombFriction, MotorCurve, ViscousDamping
 from tests.diagnosis.pendulum import MODEL, add_damping, record
@@ -47,6 +48,9 @@ def test_it_is_found_and_takes_the_place_of_the_models(size):
         "Missing: another size of viscous_damping at joint/hinge; held-out"
     )
     assert "  + another size of viscous_damping at joint/hinge (coefficient 0.0" in str(found)
+    (shown,) = parameters_section(found, DAMPED)[0].tables
+    assert shown.columns[-1] == "in the model as it is"
+    assert [row[-1] for row in shown.rows] == [pytest.approx(0.02)]
     said = "The model needs another size of viscous damping at joint/hinge. With it"
     assert diagnosis_lead(found).startswith(said)
 
