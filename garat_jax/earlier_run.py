@@ -15,6 +15,7 @@ from garat_jax.runs import (
     CONFIG,
     CONTENTS,
     check_replaceable,
+    has_ended,
     holds_results,
     is_occupied,
     not_of_run,
@@ -51,13 +52,15 @@ def earlier_run_kept(root: Path) -> Iterator[None]:
             raise
         if not is_kept:
             raise EarlierRunStays(f"the earlier run stays in {root}") from None
-        news = f"the earlier run is kept in {aside} until this one has ended"
+        news = f"the earlier run is kept in {aside} until one has ended in its place"
         raise KeyboardInterrupt(news) from None
-    shutil.rmtree(aside, ignore_errors=True)
+    forget_earlier(root)
 
 
 def put_back_earlier(root: Path, resume: bool) -> bool:
     """Put the run back that one which was interrupted or killed was to replace.
+
+    If that one, or another in its place, has ended all the same, the earlier run goes.
 
     Args:
         root: The folder of the run.
@@ -81,6 +84,9 @@ def put_back_earlier(root: Path, resume: bool) -> bool:
             f"{aside} holds the run that was to be replaced by one that did not end, in {root}, "
             "where there is something else now, so both are left alone; move one of them away"
         )
+    if has_ended(root):
+        forget_earlier(root)
+        return False
     if resume and holds_results(root):
         return False
     shutil.rmtree(root, ignore_errors=True)
@@ -90,7 +96,12 @@ def put_back_earlier(root: Path, resume: bool) -> bool:
 
 def forget_earlier(root: Path) -> None:
     """Remove the run that one which has ended was to replace."""
-    shutil.rmtree(_aside(Path(os.path.abspath(root))), ignore_errors=True)
+    aside = _aside(Path(os.path.abspath(root)))
+    if aside.is_dir():
+        gone = aside.with_suffix(".gone")
+        shutil.rmtree(gone, ignore_errors=True)
+        aside.rename(gone)  # at once, so that it is whole or not there
+        shutil.rmtree(gone, ignore_errors=True)
 
 
 def _aside(root: Path) -> Path:

@@ -72,7 +72,10 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, but within a function that C entered; hold it for `raise_held`."""
+    """Raise KeyboardInterrupt, but within a function that C entered.
+
+    It is held for `raise_held` in any case: what is raised may be lost elsewhere, too.
+    """
     del number
     _held.set()
     collecting = {getattr(callback, "__code__", None) for callback in gc.callbacks}

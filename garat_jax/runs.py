@@ -27,7 +27,7 @@ SECONDS = "seconds.json"
 CONTENTS = ".contents"
 """Names at the top of the folder that the run has written, a line each: others are the user's."""
 FILES = ".files"
-"""Every file of the run at its end, a line each: others came later and are the user's."""
+"""Every file of a run that has ended, a line each: others came later and are the user's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,11 +38,13 @@ class RunDirectory:
         root: The folder.
         resumed: Whether the folder held this run before it was opened.
         made: The folders that were made for it to lie in, innermost first.
+        others: What the folder held beside the run when that was gone on with.
     """
 
     root: Path
     resumed: bool = False
     made: tuple[Path, ...] = dataclasses.field(default=(), repr=False)
+    others: tuple[str, ...] = dataclasses.field(default=(), repr=False)
 
     @classmethod
     def create(
@@ -84,8 +86,9 @@ class RunDirectory:
         if is_occupied(root):
             if resume:
                 _check_same_run(root, line, record)
+                others = tuple(not_of_run(root))
                 (root / FILES).unlink(missing_ok=True)  # there will be more
-                return cls(root, resumed=True)
+                return cls(root, resumed=True, others=others)
             check_replaceable(root)
             if not force:
                 go_on = "" if resume is None else "--resume to go on, "
@@ -152,9 +155,9 @@ class RunDirectory:
                     folder.rmdir()
 
     def note_files(self) -> None:
-        """Write down which files the run has left, at its end."""
-        if self.root.is_dir():
-            write_whole(self.root / FILES, "".join(f"{name}\n" for name in _files(self.root)))
+        """Write down that the run has ended, and which files it has left."""
+        names = sorted(_files(self.root).difference(self.others))
+        write_whole(self.root / FILES, "".join(f"{name}\n" for name in names))
 
     def path(self, name: str) -> Path:
         """Return the path of a file in the run, and make the folder that it belongs to."""
@@ -247,13 +250,21 @@ def _parsed(text: str, path: Path) -> Any:
         raise UserError(f"{path} is damaged ({error}); start anew with --force") from error
 
 
+def has_ended(root: Path) -> bool:
+    """Say whether the run in a folder has ended."""
+    return (root / FILES).exists()
+
+
 def not_of_run(root: Path) -> list[str]:
-    """List what a folder holds beside the run in it; nothing where that has noted nothing."""
+    """List what a folder holds beside the run in it, and beside the runs within that."""
+    others = set()
     for noted, present in ((FILES, _files(root)), (CONTENTS, _names(root))):
         if (root / noted).exists():
             written = (root / noted).read_text(encoding="utf-8").splitlines()
-            return sorted(present.difference(written))
-    return []
+            others |= present.difference(written)
+    within = [part for part in root.glob("*") if is_run(part)]
+    others |= {f"{part.name}/{name}" for part in within for name in not_of_run(part)}
+    return sorted(others)
 
 
 def _names(root: Path) -> set[str]:
@@ -329,9 +340,6 @@ def check_replaceable(root: Path) -> None:
             f"{root} holds {', '.join(others)}, which the run in it did not write, so it is left "
             "alone; move that away or give another --out"
         )
-    for part in root.iterdir():
-        if is_run(part):
-            check_replaceable(part)
     if Path.cwd().resolve().is_relative_to(root.resolve()):
         raise UserError(
             f"{root} is the current folder or holds it, so it is left alone; "

@@ -115,3 +115,20 @@ def test_a_file_that_a_killed_process_had_not_finished_is_no_result(tmp_path):
     (tmp_path / "run" / ".123.seconds.json").write_text("{")
     assert put_back_earlier(tmp_path / "run", resume=True)
     assert len(list(RunDirectory.open(tmp_path / "run").metrics())) == 1
+
+
+def test_an_earlier_run_goes_where_another_has_ended_in_its_place(tmp_path):
+    create(tmp_path / ".run.replaced").log(1, loss=1.0)
+    create(tmp_path / "run", seeds=[7]).note_files()
+    assert not put_back_earlier(tmp_path / "run", resume=False)
+    assert RunDirectory.open(tmp_path / "run").read_json("config.json")["seeds"] == [7]
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_what_a_user_has_added_within_a_run_that_did_not_end_stays(tmp_path):
+    create(tmp_path / ".run.replaced").log(1, loss=1.0)
+    within = create(create(tmp_path / "run").path("part"))
+    (within.root / "thesis.tex").write_text("years of work")
+    with pytest.raises(UserError, match="both are left alone"):
+        put_back_earlier(tmp_path / "run", resume=False)
+    assert (within.root / "thesis.tex").exists()

@@ -87,7 +87,7 @@ def test_force_leaves_alone_what_a_user_has_added_to_a_run_within_a_run(tmp_path
     create(tmp_path, seeds=[7], force=True)
     inner = create(RunDirectory(tmp_path).path("part"))
     (inner.root / "thesis.tex").write_text("years of work")
-    with pytest.raises(UserError, match=r"part holds thesis\.tex"):
+    with pytest.raises(UserError, match=r"holds part/thesis\.tex"):
         create(tmp_path, force=True)
 
 
@@ -105,9 +105,27 @@ def test_force_leaves_a_run_alone_to_whose_folders_a_user_has_added_a_file(tmp_p
 
 def test_a_run_that_goes_on_may_write_more_files(tmp_path):
     create(tmp_path).note_files()
-    create(tmp_path, resume=True).path("data/one.csv").write_text("")
+    run = create(tmp_path, resume=True)
+    run.path("data/one.csv").write_text("")
     create(tmp_path, force=True)
     assert not (tmp_path / "data").exists()
+
+
+def test_a_run_that_goes_on_does_not_take_a_users_files_for_its_own(tmp_path):
+    run = create(tmp_path)
+    run.path("data/one.csv").write_text("")
+    run.note_files()
+    (tmp_path / "data" / "mine.csv").write_text("years of work")
+    create(tmp_path, resume=True).note_files()
+    with pytest.raises(UserError, match=r"holds data/mine\.csv"):
+        create(tmp_path, force=True)
+
+
+def test_a_users_folder_is_seen_though_it_holds_no_file(tmp_path):
+    create(tmp_path).note_files()
+    (tmp_path / "paper").mkdir()
+    with pytest.raises(UserError, match="holds paper"):
+        create(tmp_path, force=True)
 
 
 def test_a_run_that_did_not_note_what_it_wrote_is_replaced_as_a_whole(tmp_path):

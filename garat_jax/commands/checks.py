@@ -52,10 +52,10 @@ def make_run(
     }
     line = shlex.join([PROGRAM, *sys.argv[1:]])
     replaces = command.force and not resume
-    if (command.force or resume) and put_back_earlier(out, bool(resume)):
-        complain(f"put the run back in {out} that one which did not end was to replace", 0)
     if replaces:
         _check_outside(command, out)
+    if (command.force or resume) and put_back_earlier(out, bool(resume)):
+        complain(f"put the run back in {out} that one which did not end was to replace", 0)
     with earlier_run_kept(out) if replaces else contextlib.nullcontext():
         run = RunDirectory.create(out, config, line, seeds, force=command.force, resume=resume)
         if resume and not run.resumed:
@@ -68,8 +68,7 @@ def make_run(
         except (UserError, RuntimeError):
             run.discard()
             raise
-        finally:
-            run.note_files()
+        run.note_files()
     if resume:
         forget_earlier(out)
 

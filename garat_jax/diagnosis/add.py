@@ -46,7 +46,7 @@ class Sized(NamedTuple):
         error_before: Error on the recordings, relative to each signal's standard deviation.
         error_after: The same with the effect.
         dead: Parameters that stay at no effect, because they change no signal.
-        unsure: Those within whose interval no effect lies.
+        unsure: Those that act alone, and within whose interval no effect lies.
     """
 
     effect: Effect
@@ -231,7 +231,11 @@ def size(
         error_before=metric.error(before.residual, problem.fitted),
         error_after=metric.error(best.residual, problem.fitted),
         dead=tuple(dead),
-        unsure=tuple(name for name, e in found.items() if e.low <= none[name] <= e.high),
+        unsure=tuple(
+            name
+            for name in [p.name for p in effect.parameters()][: None if effect.independent else 1]
+            if name in found and found[name].low <= none[name] <= found[name].high
+        ),
     )
 
 

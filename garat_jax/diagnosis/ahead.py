@@ -49,8 +49,9 @@ class Path(NamedTuple):
     @property
     def second(self) -> Contender | None:
         """What would pass then, or would but for another that explains as much."""
-        candidate, contender = self.then[0]
-        return contender if candidate.passes or candidate.why == NO_CERTAIN_LEAD else None
+        for candidate, contender in self.then[:1]:
+            return contender if candidate.passes or candidate.why == NO_CERTAIN_LEAD else None
+        return None
 
     @property
     def added(self) -> list[Candidate]:

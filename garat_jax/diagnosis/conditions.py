@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.compare import read_recordings
-from garat_jax.diagnosis.diagnose import check_motion, diagnose, split, thin
+from garat_jax.diagnosis.diagnose import diagnose, split, thin
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.guesses import with_guesses
@@ -118,7 +118,6 @@ def check_conditions(model: Model, conditions: Mapping[str, Sequence[Recording]]
     for name, measured in conditions.items():
         try:
             fitted, held_out, _ = split(checked(measured), ())
-            check_motion(fitted, held_out)
             grid_for(thin((*fitted, *held_out)), native_model(model.compile(engine="mujoco")))
         except UserError as error:
             raise UserError(f"under the condition {name}: {error}") from error

@@ -83,7 +83,6 @@ def diagnose_keeping(
     """
     started = time.monotonic()
     fitted, held_out, how = split(checked(recordings), checked(holdout, least=0))
-    check_motion(fitted, held_out)
     everything = thin((*fitted, *held_out))
     whole = model.with_effects(shared)
     world = whole.compile(engine="mujoco")
@@ -95,6 +94,7 @@ def diagnose_keeping(
     say(say_horizon(everything, horizon))
     simulator = make_simulator(whole, grid)
     warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
+    warnings += warn_of_rest(fitted, held_out)
     warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, everything, grid, horizon)
     suggested = suggest(simulator.effects, host, fitted, world)
@@ -165,23 +165,22 @@ def split(
     return (first,), (last,), "on the last third of the only recording"
 
 
-def check_motion(fitted: Sequence[Recording], held_out: Sequence[Recording]) -> None:
-    """Refuse recordings of which either part moves alone: nothing is found or proved on the other.
+def warn_of_rest(fitted: Sequence[Recording], held_out: Sequence[Recording]) -> tuple[str, ...]:
+    """Say where nothing moves, in all that is to be fitted or in all that is held out, not both.
 
-    Raises:
-        UserError: No command of the other changes, and no signal by more than `QUIET` times its
-            noise.
+    Rest says something where the model would move, and little elsewhere.
     """
-    parts = (fitted, "to fit", "found"), (held_out, "held out", "proved")
+    parts = (fitted, "to be fitted", "found"), (held_out, "held out", "proved")
     still = [part for part in parts if not any(map(_moves, part[0]))]
-    if len(still) == 1:
-        ((recordings, what, why),) = still
-        names = ", ".join(recording.name for recording in recordings)
-        raise UserError(
-            f"nothing moves in {names} ({what}): no command changes, and no signal by more than "
-            f"{QUIET:g} times its noise, so that nothing can be {why} there; record motion, or "
-            "hold out others"
-        )
+    if len(still) != 1:
+        return ()
+    ((recordings, what, why),) = still
+    names = ", ".join(recording.name for recording in recordings)
+    return (
+        f"nothing moves in what is {what} ({names}): no command changes, and no signal by more "
+        f"than {QUIET:g} times its noise, so that little can be {why} there; record motion, or "
+        "hold out others (--holdout)",
+    )
 
 
 def _moves(recording: Recording) -> bool:
@@ -244,8 +243,10 @@ def make_candidates(model: Model) -> tuple[Effect, ...]:
 
 
 def sizable(model: Model) -> tuple[Effect, ...]:
-    """Return the model's own effects that have a size; a law that a table gives has none."""
-    return tuple(e for e in model.effects if not any(getattr(e, name) for name in e.tables))
+    """Return the model's own effects of its catalogue that have a size; those of a table do not."""
+    of_table = [any(getattr(e, name) for name in e.tables) for e in model.effects]
+    pairs = zip(model.effects, of_table, strict=True)
+    return tuple(e for e, is_table in pairs if e.kind in model.catalogue and not is_table)
 
 
 def make_simulator(model: Model, grid: Grid) -> Simulator:

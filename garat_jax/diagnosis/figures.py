@@ -248,7 +248,10 @@ def ranking(candidates: Sequence[Candidate]) -> go.Figure:
 
 def ladder(diagnosis: Diagnosis) -> go.Figure:
     """Draw the error falling as effects are added."""
-    names = [f"+ {label(r.added)}" if r.added else "model as it is" for r in diagnosis.ladder]
+    names = [
+        f"+ {diagnosis.spelled(r.added.named, label)}" if r.added else "model as it is"
+        for r in diagnosis.ladder
+    ]
     figure = go.Figure()
     for name, errors, colour in (
         ("recordings fitted", [100 * r.error_fit for r in diagnosis.ladder], FAINT),

@@ -100,6 +100,7 @@ class Improvement:
             "drifts",
             "warnings",
             "unseen",
+            "own",
         )
         return {
             "format": FORMAT,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import sys
 
 import jax.numpy as jnp
 import pytest
@@ -58,7 +59,16 @@ def test_it_is_found_and_takes_the_place_of_the_models(size):
 def test_of_the_right_size_it_is_left_alone():
     found = diagnose(DAMPED, recordings(0.02))
     assert (found.verdict, found.selected) == ("adequate", ())
-    assert DAMPING not in {Named(u.effect, u.target) for u in found.unseen}
+
+
+def test_what_a_model_has_is_not_listed_as_what_recordings_cannot_show():
+    noisy = [record(add_damping, seed, noise=0.2) for seed in range(3)]
+    of_plain, of_damped = (
+        {Named(one.effect, one.target) for one in diagnose(model, noisy).unseen}
+        for model in (dataclasses.replace(MODEL, catalogue=FEW), DAMPED)
+    )
+    assert DAMPING in of_plain
+    assert DAMPING not in of_damped
 
 
 def test_a_law_of_a_table_has_no_size():
@@ -81,11 +91,51 @@ def test_improving_a_model_replaces_it_and_adds_what_else_is_missing():
     assert "another size of viscous_damping at joint/hinge" in done.card
 
 
+def test_a_later_round_may_size_an_effect_again(monkeypatch):
+    data = recordings(0.008)
+    first = diagnose(DAMPED, data)
+    (damping,) = first.selected
+    size = dataclasses.replace(damping.parameters["coefficient"], estimate=0.009)
+    again = dataclasses.replace(damping, parameters={"coefficient": size})
+    second, last = (dataclasses.replace(first, selected=found) for found in ((again,), ()))
+    rounds = iter([first, second, last])
+    module = sys.modules["garat_jax.diagnosis.improve"]
+    monkeypatch.setattr(module, "diagnose", lambda *arguments: next(rounds))
+    done = improve(DAMPED, data)
+    (found,) = done.diagnosis.selected
+    assert found.parameters["coefficient"].estimate == 0.009
+    assert [rung.added and rung.added.named for rung in done.diagnosis.ladder] == [None, DAMPING]
+    assert len(done.model.effects) == 2
+
+
 def test_only_the_condition_that_shows_another_size_has_it():
     found = diagnose_conditions(DAMPED, recordings(0.02), {"warm": recordings(0.008, (3, 4, 5))})
     assert found.selected == ()
     (warm,) = found.conditions["warm"].selected
     assert warm.parameters["coefficient"].estimate == pytest.approx(0.008, rel=0.05)
+
+
+def test_an_effect_of_its_own_acts_where_another_condition_changes_it():
+    def change(spec, damping):
+        add_damping(spec, size=damping)
+        spec.joint("hinge").frictionloss = 0.05
+
+    own = CoulombFriction("joint/hinge", torque=0.1)
+    cold, warm = (functools.partial(change, damping=size) for size in (0.02, 0.008))
+    found = diagnose_conditions(
+        DAMPED.with_effects((own,)),
+        [record(cold, seed) for seed in range(3)],
+        {"warm": [record(warm, seed) for seed in (3, 4, 5)]},
+    )
+    (friction,), (damping,) = found.selected, found.conditions["warm"].selected
+    assert friction.parameters["torque"].estimate == pytest.approx(0.05, rel=0.05)
+    assert damping.parameters["coefficient"].estimate == pytest.approx(0.008, rel=0.1)
+    assert {own.kind, DAMPING.effect} == {named.effect for named in found.own}
+
+
+def test_a_kind_that_the_catalogue_lacks_is_left_as_it_is():
+    few = {"coulomb_friction": CATALOGUE["coulomb_friction"]}
+    assert sizable(dataclasses.replace(DAMPED, catalogue=few)) == ()
 
 
 def test_a_model_takes_effects_in_the_place_of_its_own():

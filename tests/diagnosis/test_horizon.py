@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis.conditions import diagnose_conditions
-from garat_jax.diagnosis.diagnose import check_motion, diagnose
+from garat_jax.diagnosis.diagnose import diagnose, warn_of_rest
 from garat_jax.diagnosis.held_out import longest_errors
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer, cut_longest
 from garat_jax.diagnosis.measurements import Recording
@@ -192,22 +191,25 @@ def test_a_gap_that_recordings_held_out_never_show_is_a_warning():
     assert "it does not predict qpos.hinge and qvel.hinge of the others" in " ".join(found.warnings)
 
 
-def test_nothing_is_found_in_or_proved_on_recordings_in_which_nothing_moves():
-    model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
+def test_it_is_said_where_nothing_moves():
     moves = record(weaken, 0)
     stuck = dataclasses.replace(moves, qpos=0 * moves.qpos, qvel=0 * moves.qvel, name="rest")
     still = dataclasses.replace(stuck, ctrl=0 * moves.ctrl)
     noise = np.random.default_rng(0).normal(size=(len(still.time), 2)) * [1e-3, 1e-2]
     noisy = dataclasses.replace(still, qpos=noise[:, :1], qvel=noise[:, 1:], name="quiet")
-    with pytest.raises(UserError, match=r"^nothing moves in rest, quiet \(to fit\): .* found"):
-        diagnose(model, [still, noisy], [moves])
-    with pytest.raises(UserError, match=r"^nothing moves in quiet \(held out\): .* proved there"):
-        diagnose(model, [moves], [noisy])
-    check_motion([stuck], [moves])  # what commands do not move tells of friction
-    with pytest.raises(UserError, match="under the condition warm: nothing moves in quiet"):
-        diagnose_conditions(model, [moves], {"warm": [noisy, moves]})
-    alike = diagnose(model, [noisy, noisy], [noisy])
-    assert (alike.verdict, alike.still, alike.warnings) == ("adequate", True, ())
+    (said,) = warn_of_rest([still, noisy], [moves])
+    assert said.startswith("nothing moves in what is to be fitted (rest, quiet): no command")
+    assert "so that little can be proved there" in warn_of_rest([moves], [noisy])[0]
+    assert not warn_of_rest([noisy], [noisy])
+    assert not warn_of_rest([stuck], [moves])  # what commands do not move tells of friction
+    assert not warn_of_rest([dataclasses.replace(still, spans=((0, 9),)), moves], [moves])
+    begins = dataclasses.replace(moves, spans=((0, 20),), qpos=moves.qpos + 0, ctrl=still.ctrl)
+    begins.qpos[:20], begins.qvel[:20] = 0.0, 0.0
+    assert warn_of_rest([begins], [moves])  # beyond its span it moves
+    fast = dataclasses.replace(still, qvel=moves.qvel, velocity_measured=False)
+    assert warn_of_rest([fast], [moves])
+    model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
+    assert warn_of_rest([moves], [noisy])[0] in diagnose(model, [moves], [noisy]).warnings
 
 
 SERVO = """
