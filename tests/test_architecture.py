@@ -67,6 +67,7 @@ def test_an_upward_import_breaks_the_contracts(tmp_path):
     words = (
         "commandline",
         "compilation_cache",
+        "earlier_run",
         "errors",
         "interrupt",
         "files",
