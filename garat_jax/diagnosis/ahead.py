@@ -20,6 +20,7 @@ from garat_jax.diagnosis.judge import (
     held_out_gain,
     is_certain,
     leads,
+    simplest,
 )
 from garat_jax.diagnosis.metric import AT_FLOOR, Metric, is_above, noise_floor
 from garat_jax.diagnosis.problem import Problem
@@ -118,6 +119,10 @@ def _one_or_two(
     if not followed:
         return judged, first_step(problem, judged, current)
     best = min(followed, key=lambda path: path.fit.cost.sum())
+    if best.second:
+        others = [path.fit for path in followed if path.second]
+        simple = simplest(problem, metric, best.fit, others)
+        best = next(path for path in followed if path.fit is simple)
     known = [k.fit for first, k in judged[:1] if k and first.passes]
     gains = best.second and is_certain(held_out_gain(problem, metric, current, best.fit))
     if not gains or not all(leads(problem, best.fit, fit) for fit in known):

@@ -7,7 +7,7 @@ import numpy as np
 
 from garat_jax.diagnosis.contend import Contender, refines
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
-from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above
+from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, noise_floor
 from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem, block_labels
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
@@ -293,6 +293,23 @@ def leads(problem: Problem, first: Fit, second: Fit, by: float = TOO_CLOSE) -> b
     drawn = np.log(_resamples(costs.shape[1]) @ costs.T)
     lead = drawn[:, 1] - drawn[:, 0]
     return bool(np.quantile(lead, 0.025) > 0 and np.median(lead) > np.log(by))
+
+
+def simplest(problem: Problem, metric: Metric, best: Fit, others: Sequence[Fit]) -> Fit:
+    """Return the best fit, or of those that leave no more than noise, as it does, the simplest.
+
+    That is the one with the fewest parameters that the best does not lead: a slow ripple, with
+    three, does what a spring or gravity does.
+    """
+    floor = noise_floor(problem, metric, best)
+
+    def leaves_noise(fit: Fit) -> bool:
+        return not is_above(problem, metric, fit, floor, AT_FLOOR)
+
+    if not leaves_noise(best):
+        return best
+    near = [fit for fit in others if leaves_noise(fit) and not leads(problem, best, fit)]
+    return min([best, *near], key=lambda fit: len(fit.free))
 
 
 def block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):

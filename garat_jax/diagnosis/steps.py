@@ -24,7 +24,7 @@ from garat_jax.diagnosis.contend import (
 )
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
-from garat_jax.diagnosis.judge import Judged, judge, leads
+from garat_jax.diagnosis.judge import Judged, judge, leads, simplest
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, noise_floor
 from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem
@@ -195,16 +195,17 @@ def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others
 
 
 def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, say):
-    """Return a step, or what is certainly better in its place, with its equals, and the fit."""
-    better = [pair for pair in trials if _is_better(problem, pair[1].fit, fitted)]
-    if better:
-        best = min(better, key=lambda pair: pair[1].fit.cost.sum())
+    """Return a step, or what is better in its place, with its equals, and the fit.
+
+    That is what fits better for certain, or does as well with fewer parameters.
+    """
+    best, why = _better(problem, metric, step, fitted, trials)
+    if best is not None:
         instead = complete(problem, best[1], say)
         trials = [pair for pair in trials if pair is not best]
         trials.append((step.candidate, dataclasses.replace(step.contender, fit=fitted)))
         alike = [(step.candidate, step.contender)]
         alike += [pair for pair in step.alike if pair[0] is not best[0]]
-        why = f"fits better than {step.candidate.named} beside what was found since"
         candidate = dataclasses.replace(best[0], passes=True, why=why)
         step, fitted = Step(candidate, instead, instead.fit, alike), instead.fit
     floor = noise_floor(problem, metric, fitted)
@@ -215,6 +216,20 @@ def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, 
     ]
     candidate = dataclasses.replace(step.candidate, indistinguishable_from=tuple(equals))
     return step._replace(candidate=candidate), fitted
+
+
+def _better(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials):
+    """Return what comes in a step's place, None if nothing does, and why."""
+    name, beside = step.candidate.named, "beside what was found since"
+    better = [pair for pair in trials if _is_better(problem, pair[1].fit, fitted)]
+    best = min((k.fit for _, k in better), key=lambda fit: fit.cost.sum(), default=fitted)
+    best = simplest(problem, metric, best, [contender.fit for _, contender in trials])
+    for pair in trials:
+        if pair[1].fit is best:
+            fits_better = any(pair is other for other in better)
+            as_well = f"fits as well as {name} with fewer parameters, {beside}"
+            return pair, f"fits better than {name} {beside}" if fits_better else as_well
+    return None, ""
 
 
 def _is_equal(problem: Problem, metric: Metric, floor: Floor, fitted: Fit, other: Fit) -> bool:

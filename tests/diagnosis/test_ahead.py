@@ -42,6 +42,8 @@ def chosen(
     num_held: int = 0,
     why_first: str = NO_CERTAIN_GAIN,
     like_gravity: tuple[Named, ...] = (),
+    like_second: tuple[Named, ...] = (),
+    more: tuple[int, ...] = (),
 ):
     """Choose where damping, gravity and an offset explain 20, 19 and 18 % each by itself.
 
@@ -53,6 +55,8 @@ def chosen(
         num_held: How many effects are said to be selected.
         why_first: What is said of damping.
         like_gravity: What is not told from gravity.
+        like_second: What is not told from the best effect beside gravity.
+        more: Parameters that are free beside damping, besides its own and the best effect's.
     """
     current = settle(problem, problem.simulator.base, problem.segments.start)
     residual = np.random.default_rng(0).normal(size=current.residual.shape)
@@ -74,7 +78,11 @@ def chosen(
         beside = seconds.get(contender.score.effect)
         if beside is None:
             return [pair(DAMPING, 0.8, NO_CERTAIN_GAIN)]
-        return [pair(effect, left, why) for effect, left in beside.items()]
+        second = [pair(effect, left, why) for effect, left in beside.items()]
+        if contender.score.effect == DAMPING:
+            return [(c, _with_more_free(k, more)) for c, k in second]
+        alike = [dataclasses.replace(c, indistinguishable_from=like_second) for c, _ in second]
+        return [(c, k) for c, (_, k) in zip(alike, second, strict=True)]
 
     judged = [
         pair(DAMPING, 0.80, why_first),
@@ -88,6 +96,11 @@ def chosen(
     say = [].append
     judged, steps = choose(problem, metric, current, judged, [*range(num_held)], follow, say)
     return judged[0][0], [step.candidate.named for step in steps]
+
+
+def _with_more_free(contender: Contender, more: tuple[int, ...]) -> Contender:
+    fit = dataclasses.replace(contender.fit, free=(*contender.fit.free, *more))
+    return dataclasses.replace(contender, fit=fit)
 
 
 def named(effect: int) -> Named:
@@ -129,6 +142,17 @@ def test_what_all_paths_have_second_is_not_added_where_it_does_not_pass(problem)
     first, added = chosen(problem, {FRICTION: 0.3}, {FRICTION: 0.301}, NO_CERTAIN_LEAD)
     assert added == []
     assert not first.passes
+
+
+@pytest.mark.parametrize("leaves_noise", [True, False])
+def test_of_paths_that_leave_no_more_than_noise_the_one_with_the_fewest_parameters_counts(
+    problem, monkeypatch, leaves_noise
+):
+    """Gravity and friction do what damping and an offset do, with a parameter less."""
+    monkeypatch.setattr("garat_jax.diagnosis.judge.is_above", lambda *of: not leaves_noise)
+    like = {"like_gravity": (named(OFFSET),), "like_second": (named(DAMPING),)}
+    _, added = chosen(problem, {OFFSET: 0.3}, {FRICTION: 0.301}, PASSES, more=(OFFSET,), **like)
+    assert added == ([named(GRAVITY), named(FRICTION)] if leaves_noise else [named(DAMPING)])
 
 
 def test_nothing_is_added_where_no_path_leads_and_they_share_nothing(problem):
