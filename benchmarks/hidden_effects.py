@@ -4,8 +4,9 @@ Thresholds are tuned on seed 0; a seed whose sets nobody has looked at says what
 data. Every seed has a result file of its own. Rows are appended to OUT/rows.jsonl as they come, so
 an interrupted run goes on. `--sample N` diagnoses the first N sets of a random order; the result
 says of how many. A larger sample with `--extend` keeps what the result file has, but for the sets
-of robots that are measured `--anew`; each row has its commit. A set that takes longer than
-`--limit` counts as wrong. A run of hand-picked cases writes no result. `--timing` needs
+of robots that are measured `--anew`; each row has its commit. `--category` is for a share that is
+to be known better than its part in such a sample says. A set that takes longer than `--limit`
+counts as wrong. A run of hand-picked cases writes no result. `--timing` needs
 `pip install 'mujoco[sysid]'`.
 """
 
@@ -195,6 +196,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="tune on 0, report on others")
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="cases whose name holds a text")
+    parser.add_argument("--category", choices=score.CATEGORIES, help="its sets alone")
     parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
     parser.add_argument("--sample", type=int, metavar="N", help="the first N of a random order")
     parser.add_argument("--extend", action="store_true", help="keep the rows of the result file")
@@ -216,6 +218,8 @@ def main() -> None:
     num_cases = len(cases)
     if arguments.anew and not arguments.extend:
         parser.error("--anew needs --extend: it is said of which rows are kept")
+    if arguments.category:
+        cases = [case for case in cases if case.category == arguments.category]
     if arguments.only:
         cases = [c for c in cases if any(text in c.name for text in arguments.only)]
     cases = cases[: arguments.sample]
@@ -228,7 +232,8 @@ def main() -> None:
     lines = report(rows)
     picked = arguments.only or arguments.robots != list(ROBOTS)
     if not picked and not any(row["status"] == score.NOT_YET for row in rows):
-        details = {"cases": num_cases, "sample": len(rows), "anew": arguments.anew, "table": lines}
+        details = {"cases": num_cases, "sample": len(rows), "category": arguments.category}
+        details |= {"anew": arguments.anew, "table": lines}
         name, seeds = result_name(arguments.seed), [arguments.seed]
         print(write_result(name, rows, seeds=seeds, command=command, details=details))
 
