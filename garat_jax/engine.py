@@ -1,14 +1,13 @@
 """C MuJoCo within compiled programs: a callback that steps a whole batch on threads."""
 
 import collections
-import contextlib
 import ctypes
 import functools
 import hashlib
 import logging
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -152,20 +151,23 @@ class HostModel:
         A program may call this for every physics substep of a few simulations, which take less
         time than a dozen lines of Python.
         """
-        rows, controls, *values = (np.ascontiguousarray(value).view(dtype) for value in words)
-        leading = np.broadcast_shapes(*{value.shape[:-1] for value in words})
+        rows, controls, *values = [value.view(dtype) for value in words]
+        leadings = {value.shape[:-1] for value in words}
+        leading = leadings.pop() if len(leadings) == 1 else np.broadcast_shapes(*leadings)
         num = math.prod(leading)
         rows = _over(leading, rows).reshape(num, -1)
         controls = _over(leading, controls).reshape(num, -1, self.model.nu + self.model.nv)
-        with self._simulations(num, names) as simulations:
-            simulations.write_fields(values, leading)
-            simulations.state[:] = rows
-            finite = np.isfinite(rows).all(axis=1)
-            result = function(simulations, controls, None if finite.all() else finite)
-            _log_warnings()
-            if result.dtype != rows.dtype:
-                with np.errstate(over="ignore"):  # what exploded is infinite in 32 bits
-                    result = result.astype(rows.dtype)
+        key = (self.digest, num, names)
+        simulations = _borrowed(key) or _Simulations(self.model, num, names)
+        simulations.write_fields(values, leading)
+        simulations.state[:] = rows
+        finite = np.isfinite(rows)
+        result = function(simulations, controls, None if finite.all() else finite.all(axis=1))
+        _give_back(key, simulations)
+        _log_warnings()
+        if result.dtype != rows.dtype:
+            with np.errstate(over="ignore"):  # what exploded is infinite in 32 bits
+                result = result.astype(rows.dtype)
         return result.reshape(*leading, -1).view(np.uint32)
 
     def _advance_batch(
@@ -207,19 +209,6 @@ class HostModel:
         path[~(done[:, None] > steps - 0.5)] = np.nan
         return path
 
-    @contextlib.contextmanager
-    def _simulations(self, num: int, fields: tuple[str, ...]) -> Iterator["_Simulations"]:
-        """Lend simulations for a batch size; each set of changed fields has its own."""
-        key = (self.digest, num, fields)
-        with _idle_lock:
-            found = [index for index, (kept, _) in enumerate(_idle) if kept == key]
-            simulations = _idle.pop(found[-1])[1] if found else None
-        simulations = simulations or _Simulations(self.model, num, fields)
-        yield simulations
-        with _idle_lock:
-            _idle.append((key, simulations))
-            del _idle[:-KEPT_BATCHES]
-
 
 class _Simulations:
     """A batch, and what of it is written and read in each call.
@@ -248,11 +237,27 @@ class _Simulations:
         stale = False
         for (name, held), value in zip(self.fields.items(), values, strict=True):
             value = _over(leading, value).reshape(held.shape)
-            if (held != value).any():
+            if held.tobytes() != value.tobytes():
                 held[...] = value
                 stale = stale or name in CONSTANT_INPUTS
         if stale:
             self.batch.set_const()
+
+
+def _borrowed(key: tuple) -> _Simulations | None:
+    """Take simulations for a model, a batch size and a set of changed fields, if any are idle."""
+    with _idle_lock:
+        for index in range(len(_idle) - 1, -1, -1):
+            if _idle[index][0] == key:
+                return _idle.pop(index)[1]
+    return None
+
+
+def _give_back(key: tuple, simulations: _Simulations) -> None:
+    """Keep simulations for the next call."""
+    with _idle_lock:
+        _idle.append((key, simulations))
+        del _idle[:-KEPT_BATCHES]
 
 
 def _over(leading: tuple[int, ...], value: np.ndarray) -> np.ndarray:

@@ -59,7 +59,7 @@ def call(name: str, function: HostFunction, size: int, inputs: Sequence[jax.Arra
     shape = jax.ShapeDtypeStruct((size,), jnp.uint32)
     if jax.default_backend() != "cpu" or not _is_registered():
         return jax.pure_callback(
-            lambda *arrays: function([np.asarray(array) for array in arrays]),
+            lambda *arrays: function([np.ascontiguousarray(array) for array in arrays]),
             shape,
             *inputs,
             vmap_method="expand_dims",
@@ -174,8 +174,8 @@ def _array(buffer: _Buffer) -> np.ndarray:
     size = math.prod(shape)
     if not size:
         return np.empty(shape, np.uint32)
-    words = (ctypes.c_uint32 * size).from_address(buffer.data)
-    return np.ctypeslib.as_array(words).reshape(shape)
+    memory = (ctypes.c_uint32 * size).from_address(buffer.data)
+    return np.frombuffer(memoryview(memory), np.uint32).reshape(shape)
 
 
 @entered_from_c

@@ -14,6 +14,11 @@ from garat_jax.diagnosis.segments import Segments
 SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
 substep, many simulations share its cost. Each size is compiled once."""
+FEW = 32
+"""Simulations in a batch where there are no more and calls are `MANY`: rows that are not used cost
+a fifth of a call."""
+MANY = 4000
+"""Calls of one segment from which a program of its own size pays for being compiled."""
 
 
 class Program(NamedTuple):
@@ -23,12 +28,13 @@ class Program(NamedTuple):
         run: Takes a batch of (theta, start, ctrl, place), the `Past` if it looks back, else None,
             and a path if it looks along one.
         looks_back: Whether an effect remembers, or has a memory of the motion.
-        is_stepped: Whether C MuJoCo is called for every physics substep.
+        num_substeps: Physics substeps of a control step, each of which is a call of C MuJoCo; 0
+            where a whole segment is one.
     """
 
     run: jax.stages.Wrapped
     looks_back: bool
-    is_stepped: bool
+    num_substeps: int
 
 
 class Batches(NamedTuple):
@@ -76,7 +82,10 @@ class Batches(NamedTuple):
 
     @property
     def _size(self) -> int:
-        return SIZES[self.program.is_stepped and self._total > 2 * SIZES[0]]
+        num_calls = self.program.num_substeps * self.segments.ctrl.shape[1]
+        if self._total <= FEW and num_calls >= MANY:
+            return FEW
+        return SIZES[num_calls > 0 and self._total > 2 * SIZES[0]]
 
     def _inputs(self, first: int) -> tuple:
         """Return the program's inputs for the batch that begins with a simulation."""

@@ -258,7 +258,7 @@ class Simulator:
         runs_often = way == "at once" or len(chosen) <= FEW
         options = options_of_replay(self._alone.engine, runs_often)
         run = jax.jit(jax.vmap(one, axes), compiler_options=options)
-        return Program(run, looks_back, way == "stepped")
+        return Program(run, looks_back, self._substeps if way == "stepped" else 0)
 
     def _batches(self, program: Program, segments: Segments, theta, start, path=None) -> Batches:
         """Lay out the batches of a program; see `Batches`."""

@@ -38,7 +38,7 @@ def make(segments: Segments, factor: float) -> Batches:
     run = jax.jit(jax.vmap(one, (0, 0, 0, 0, None)))
     theta = np.arange(1.0, 1.0 + ROWS)[:, None]
     start = np.broadcast_to(segments.start, (ROWS, *segments.start.shape))
-    return Batches(Program(run, False, False), segments, np.empty(0), theta, start, None)
+    return Batches(Program(run, False, 0), segments, np.empty(0), theta, start, None)
 
 
 def test_programs_compiled_together_are_not_compiled_again(num_compiled):
@@ -60,6 +60,28 @@ def test_programs_compiled_together_are_not_compiled_again(num_compiled):
         np.testing.assert_array_equal(true[0, :, 0], segments.start)
 
 
+@pytest.mark.parametrize(
+    ("rows", "num_substeps", "size"),
+    [(1, 100, 32), (2, 100, 256), (1, 99, 256), (30, 100, 1024), (30, 0, 256)],
+)
+def test_a_batch_is_as_large_as_pays(rows, num_substeps, size):
+    """32 segments of 40 control steps: 4000 calls of a segment or fewer."""
+    segments = cut([record(add_damping, 0)], choose_grid([record(add_damping, 0)], 0.002), 0.2)
+    every, number = np.arange(32) % len(segments.start), 40
+    segments = dataclasses.replace(segments, ctrl=segments.ctrl[:, :number]).take(every)
+    batches, sizes = make(segments, 2.0), []
+
+    def run(*inputs):
+        sizes.append(len(inputs[0]))
+        return batches.program.run(*inputs)
+
+    start = np.broadcast_to(segments.start, (rows, *segments.start.shape))
+    program = Program(run, False, num_substeps)
+    signals, _ = batches._replace(program=program, theta=np.ones((rows, 1)), start=start).run()
+    assert {*sizes} == {size}
+    np.testing.assert_allclose(signals[-1, :, 0], 2.0 * segments.start)
+
+
 def test_an_error_in_one_of_them_is_raised():
     recording = record(add_damping, 0)
     segments = cut([recording], choose_grid([recording], 0.002), 0.2)
@@ -68,7 +90,7 @@ def test_an_error_in_one_of_them_is_raised():
         raise ZeroDivisionError
 
     run = jax.jit(jax.vmap(broken, (0, 0, 0, 0, None)))
-    every = [make(segments, 1.0)._replace(program=Program(run, False, False)), make(segments, 2.0)]
+    every = [make(segments, 1.0)._replace(program=Program(run, False, 0)), make(segments, 2.0)]
     with pytest.raises(ZeroDivisionError):
         compile_together(every)
     compile_together([])
