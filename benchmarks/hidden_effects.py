@@ -4,9 +4,9 @@ Thresholds are tuned on seed 0; a seed whose sets nobody has looked at says what
 data. Every seed has a result file of its own. Rows are appended to OUT/rows.jsonl as they come, so
 an interrupted run goes on. `--sample N` diagnoses the first N sets of a random order; the result
 says of how many. A larger sample with `--extend` keeps what the result file has, but for the sets
-of robots that are measured `--anew`; each row has its commit. `--category` is for a share that is
-to be known better than its part in such a sample says. A set that takes longer than `--limit`
-counts as wrong. A run of hand-picked cases writes no result. `--timing` needs
+of robots that are measured `--anew`; each row has its commit. `--category` measures one category of
+a seed, of which a sample has few sets, and has a result file of its own. A set that takes longer
+than `--limit` counts as wrong. A run of hand-picked cases writes no result. `--timing` needs
 `pip install 'mujoco[sysid]'`.
 """
 
@@ -110,14 +110,14 @@ def read_rows(path: Path, commit: str | None) -> dict[str, dict[str, Any]]:
     return {row["case"]: row for row in same}
 
 
-def result_name(seed: int) -> str:
-    """Return the name of a seed's result file."""
-    return f"{NAME}_seed_{seed}"
+def result_name(seed: int, category: str | None) -> str:
+    """Return the name of the result file of a seed, or of one of its categories."""
+    return f"{NAME}_seed_{seed}" + (f"_{category}" if category else "")
 
 
-def recorded_rows(seed: int) -> dict[str, dict[str, Any]]:
+def recorded_rows(seed: int, category: str | None) -> dict[str, dict[str, Any]]:
     """Return the rows of the result file that come from this seed, by case."""
-    path = result_path(result_name(seed))
+    path = result_path(result_name(seed, category))
     if not path.exists():
         return {}
     rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
@@ -196,7 +196,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="tune on 0, report on others")
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="cases whose name holds a text")
-    parser.add_argument("--category", choices=score.CATEGORIES, help="its sets alone")
+    parser.add_argument("--category", choices=score.CATEGORIES, help="only sets of this")
     parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
     parser.add_argument("--sample", type=int, metavar="N", help="the first N of a random order")
     parser.add_argument("--extend", action="store_true", help="keep the rows of the result file")
@@ -215,16 +215,16 @@ def main() -> None:
         print(write_result(f"{NAME}_timing", timing.measure_all(), seeds=[], command=command))
         return
     cases = shuffled(list_cases(arguments.seed), arguments.seed)
+    if arguments.category:
+        cases = [case for case in cases if case.category == arguments.category]
     num_cases = len(cases)
     if arguments.anew and not arguments.extend:
         parser.error("--anew needs --extend: it is said of which rows are kept")
-    if arguments.category:
-        cases = [case for case in cases if case.category == arguments.category]
     if arguments.only:
         cases = [c for c in cases if any(text in c.name for text in arguments.only)]
     cases = cases[: arguments.sample]
     path = (arguments.out or Path("runs") / f"{NAME}-{arguments.seed}") / "rows.jsonl"
-    earlier = recorded_rows(arguments.seed) if arguments.extend else {}
+    earlier = recorded_rows(arguments.seed, arguments.category) if arguments.extend else {}
     if beyond := earlier.keys() - {case.name for case in cases}:
         parser.error(f"--extend would drop {len(beyond)} recorded sets; give a larger --sample")
     kept = {name: row for name, row in earlier.items() if row["robot"] not in arguments.anew}
@@ -234,7 +234,7 @@ def main() -> None:
     if not picked and not any(row["status"] == score.NOT_YET for row in rows):
         details = {"cases": num_cases, "sample": len(rows), "category": arguments.category}
         details |= {"anew": arguments.anew, "table": lines}
-        name, seeds = result_name(arguments.seed), [arguments.seed]
+        name, seeds = result_name(arguments.seed, arguments.category), [arguments.seed]
         print(write_result(name, rows, seeds=seeds, command=command, details=details))
 
 

@@ -34,7 +34,9 @@ METADATA_EXTENSION = 1
 INTERNAL_ERROR = 13
 
 HostFunction = Callable[[Sequence[np.ndarray]], np.ndarray]
-"""Arrays of 32-bit words, [..., n] each, as many leading axes in all, to words [..., size]."""
+"""Arrays of 32-bit words, [..., n] each, as many leading axes in all, to words [..., size].
+
+They are C-contiguous, and XLA's: to be read during the call alone."""
 
 _functions: dict[str, HostFunction] = {}
 """What the programs of this process may call, as long as the process lives."""

@@ -130,9 +130,9 @@ def profiling_clock() -> str:
     return table(columns, rows) + origin("profiling_clock", result)
 
 
-def hidden_effects(seed: int) -> str:
-    """One row a measure, beside what it is held to."""
-    name = f"hidden_effects_seed_{seed}"
+def hidden_effects(seed: int, category: str = "") -> str:
+    """One row a measure, beside what it is held to; of all the sets of a seed, or of a category."""
+    name = f"hidden_effects_seed_{seed}{category and '_'}{category}"
     result = read(name)
     lines = []
     for line in result["table"]:

@@ -254,8 +254,8 @@ def _share(measure: str, rows, key: str, low: float | None, high: float = 1.0) -
     line: dict[str, Any] = {"measure": measure, "value": value, "count": count}
     if value is not None:
         line["interval"] = _wilson(value, len({row["case"] for row in rows}))
-    if low is not None:
-        line |= {"target": [low, high], "met": value is not None and low <= value <= high}
+    if low is not None and value is not None:
+        line |= {"target": [low, high], "met": low <= value <= high}
         line["short"] = sorted({row["case"] for row in rows if not row.get(key)})
     return line
 

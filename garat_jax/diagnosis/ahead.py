@@ -68,6 +68,14 @@ class Path(NamedTuple):
         """Say whether an effect is added on it, or what recordings cannot tell from one that is."""
         return any(named in (c.named, *c.indistinguishable_from) for c in self.added)
 
+    def is_as_sure_as(self, other: "Path") -> bool:
+        """Say whether the first lacks at most what a second mends, the second at most the other's.
+
+        Both paths have a second.
+        """
+        lacks_little = self.candidate.passes or self.candidate.why in ANOTHER_MAY_HELP
+        return lacks_little and (self.then[0][0].passes or not other.then[0][0].passes)
+
     def is_like(self, other: "Path") -> bool:
         """Say whether the other adds the same, or what recordings cannot tell from it."""
         same_number = len(self.added) == len(other.added)
@@ -95,7 +103,8 @@ def choose(
         say: Told what is being done.
 
     Returns:
-        The candidates, the first of which passes if with another it leads its rivals with another,
+        The candidates, the first of which passes if with another it leads its rivals with another
+        (or does as well with fewer parameters),
         or if all that these do not lead add it, too, or the same beside another first; and what is
         to be added: the first if it passes, with the other if it needs that and no third explains
         as much; a next round may tell these. Where nothing is held and nothing passes so, several
@@ -118,15 +127,18 @@ def _one_or_two(
     """Return a round's candidates and what is to be added, by paths with one more; see `choose`."""
     if not followed:
         return judged, first_step(problem, judged, current)
-    best = min(followed, key=lambda path: path.fit.cost.sum())
-    if best.second:
-        others = [path.fit for path in followed if path.second]
-        simple = simplest(problem, metric, best.fit, others)
-        best = next(path for path in followed if path.fit is simple)
     known = [k.fit for first, k in judged[:1] if k and first.passes]
-    gains = best.second and is_certain(held_out_gain(problem, metric, current, best.fit))
-    if not gains or not all(leads(problem, best.fit, fit) for fit in known):
+
+    def gains(path: Path) -> bool:
+        lowers = path.second and is_certain(held_out_gain(problem, metric, current, path.fit))
+        return bool(lowers and all(leads(problem, path.fit, fit) for fit in known))
+
+    best = min(followed, key=lambda path: path.fit.cost.sum())
+    if not gains(best):
         return judged, first_step(problem, judged, current)
+    sure = [path for path in followed if gains(path) and path.is_as_sure_as(best)]
+    simple = simplest(problem, metric, best.fit, [path.fit for path in sure])
+    best = next(path for path in followed if path.fit is simple)
     others = [path for path in followed if not best.is_like(path)]
     undecided = [best, *(path for path in others if not leads(problem, best.fit, path.fit))]
     shared = _shared(undecided, judged)

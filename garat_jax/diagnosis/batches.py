@@ -14,11 +14,11 @@ from garat_jax.diagnosis.segments import Segments
 SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
 substep, many simulations share its cost. Each size is compiled once."""
-FEW = 32
-"""Simulations in a batch where there are no more and calls are `MANY`: rows that are not used cost
-a fifth of a call."""
-MANY = 4000
-"""Calls of one segment from which a program of its own size pays for being compiled."""
+SMALL = 32
+"""Simulations in the smaller batches of programs with as many substeps as `LONG`. Few segments are
+followed there at a time, and the rows of a batch of 256 that are not used cost a fifth of it."""
+LONG = 4000
+"""Substeps of a segment, each a call, from which that pays for compiling another size."""
 
 
 class Program(NamedTuple):
@@ -28,7 +28,7 @@ class Program(NamedTuple):
         run: Takes a batch of (theta, start, ctrl, place), the `Past` if it looks back, else None,
             and a path if it looks along one.
         looks_back: Whether an effect remembers, or has a memory of the motion.
-        num_substeps: Physics substeps of a control step, each of which is a call of C MuJoCo; 0
+        num_substeps: Physics substeps of a control step, where each may be a call of C MuJoCo; 0
             where a whole segment is one.
     """
 
@@ -82,10 +82,10 @@ class Batches(NamedTuple):
 
     @property
     def _size(self) -> int:
-        num_calls = self.program.num_substeps * self.segments.ctrl.shape[1]
-        if self._total <= FEW and num_calls >= MANY:
-            return FEW
-        return SIZES[num_calls > 0 and self._total > 2 * SIZES[0]]
+        num_substeps = self.program.num_substeps * self.segments.ctrl.shape[1]
+        if num_substeps >= LONG:
+            return SMALL if self._total <= SMALL else SIZES[0]
+        return SIZES[num_substeps > 0 and self._total > 2 * SIZES[0]]
 
     def _inputs(self, first: int) -> tuple:
         """Return the program's inputs for the batch that begins with a simulation."""

@@ -296,20 +296,21 @@ def leads(problem: Problem, first: Fit, second: Fit, by: float = TOO_CLOSE) -> b
 
 
 def simplest(problem: Problem, metric: Metric, best: Fit, others: Sequence[Fit]) -> Fit:
-    """Return the best fit, or of those that leave no more than noise, as it does, the simplest.
+    """Return the simplest of those that leave no more than noise and that the best does not lead.
 
-    That is the one with the fewest parameters that the best does not lead: a slow ripple, with
-    three, does what a spring or gravity does.
+    That is the one with the fewest parameters, if it has fewer than the best, which is returned
+    otherwise: a slow ripple, with three, does what a spring or gravity does.
     """
-    floor = noise_floor(problem, metric, best)
-
-    def leaves_noise(fit: Fit) -> bool:
-        return not is_above(problem, metric, fit, floor, AT_FLOOR)
-
-    if not leaves_noise(best):
+    simpler = [fit for fit in others if len(fit.free) < len(best.free)]
+    if not simpler:
         return best
-    near = [fit for fit in others if leaves_noise(fit) and not leads(problem, best, fit)]
-    return min([best, *near], key=lambda fit: len(fit.free))
+    floor = noise_floor(problem, metric, best)
+    as_good = [
+        fit
+        for fit in simpler
+        if not is_above(problem, metric, fit, floor, AT_FLOOR) and not leads(problem, best, fit)
+    ]
+    return min(as_good, key=lambda fit: (len(fit.free), fit.cost.sum()), default=best)
 
 
 def block_costs(problem: Problem, weight: np.ndarray | float, fits: Sequence[Fit], chosen):

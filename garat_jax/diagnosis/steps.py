@@ -24,7 +24,7 @@ from garat_jax.diagnosis.contend import (
 )
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
-from garat_jax.diagnosis.judge import Judged, judge, leads, simplest
+from garat_jax.diagnosis.judge import ANOTHER_MAY_HELP, Judged, judge, leads, simplest
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, noise_floor
 from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem
@@ -114,7 +114,8 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
     By itself an effect may lead for what it says of another, which was missing yet; beside that
     one, recordings may tell apart what they could not, and may no longer what they did. It is held
     against what did much the same then, and against what would come first now. One that fits better
-    by now comes in its place, and what was added since may only have made up for the wrong one.
+    by now, or as well with fewer parameters, comes in its place, and what was added since may only
+    have made up for the wrong one.
 
     Returns:
         The steps, each with those that the recordings do not tell from it now, and the fit with
@@ -195,18 +196,23 @@ def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others
 
 
 def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, say):
-    """Return a step, or what is better in its place, with its equals, and the fit.
+    """Return a step, or what comes in its place, with its equals, and the fit.
 
-    That is what fits better for certain, or does as well with fewer parameters.
+    That is what certainly fits better, or what does as well with fewer parameters.
     """
-    best, why = _better(problem, metric, step, fitted, trials)
-    if best is not None:
-        instead = complete(problem, best[1], say)
-        trials = [pair for pair in trials if pair is not best]
+    better = [pair for pair in trials if _is_better(problem, pair[1].fit, fitted)]
+    likely = better or [c for c in trials if c[0].passes or c[0].why in ANOTHER_MAY_HELP]
+    best = min((k.fit for _, k in better), key=lambda fit: fit.cost.sum(), default=fitted)
+    best = simplest(problem, metric, best, [contender.fit for _, contender in likely])
+    for pair in [pair for pair in likely if pair[1].fit is best]:
+        instead = complete(problem, pair[1], say) if better else pair[1]
+        trials = [other for other in trials if other is not pair]
         trials.append((step.candidate, dataclasses.replace(step.contender, fit=fitted)))
         alike = [(step.candidate, step.contender)]
-        alike += [pair for pair in step.alike if pair[0] is not best[0]]
-        candidate = dataclasses.replace(best[0], passes=True, why=why)
+        alike += [other for other in step.alike if other[0] is not pair[0]]
+        how = "fits better than {}" if better else "fits as well as {} with fewer parameters,"
+        why = f"{how.format(step.candidate.named)} beside what was found since"
+        candidate = dataclasses.replace(pair[0], passes=True, why=why)
         step, fitted = Step(candidate, instead, instead.fit, alike), instead.fit
     floor = noise_floor(problem, metric, fitted)
     equals = [
@@ -216,20 +222,6 @@ def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, 
     ]
     candidate = dataclasses.replace(step.candidate, indistinguishable_from=tuple(equals))
     return step._replace(candidate=candidate), fitted
-
-
-def _better(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials):
-    """Return what comes in a step's place, None if nothing does, and why."""
-    name, beside = step.candidate.named, "beside what was found since"
-    better = [pair for pair in trials if _is_better(problem, pair[1].fit, fitted)]
-    best = min((k.fit for _, k in better), key=lambda fit: fit.cost.sum(), default=fitted)
-    best = simplest(problem, metric, best, [contender.fit for _, contender in trials])
-    for pair in trials:
-        if pair[1].fit is best:
-            fits_better = any(pair is other for other in better)
-            as_well = f"fits as well as {name} with fewer parameters, {beside}"
-            return pair, f"fits better than {name} {beside}" if fits_better else as_well
-    return None, ""
 
 
 def _is_equal(problem: Problem, metric: Metric, floor: Floor, fitted: Fit, other: Fit) -> bool:

@@ -44,6 +44,7 @@ def chosen(
     like_gravity: tuple[Named, ...] = (),
     like_second: tuple[Named, ...] = (),
     more: tuple[int, ...] = (),
+    why_gravity: str = NO_CERTAIN_LEAD,
 ):
     """Choose where damping, gravity and an offset explain 20, 19 and 18 % each by itself.
 
@@ -56,6 +57,7 @@ def chosen(
         why_first: What is said of damping.
         like_gravity: What is not told from gravity.
         like_second: What is not told from the best effect beside gravity.
+        why_gravity: What is said of gravity.
         more: Parameters that are free beside damping, besides its own and the best effect's.
     """
     current = settle(problem, problem.simulator.base, problem.segments.start)
@@ -86,7 +88,7 @@ def chosen(
 
     judged = [
         pair(DAMPING, 0.80, why_first),
-        pair(GRAVITY, 0.81, NO_CERTAIN_LEAD),
+        pair(GRAVITY, 0.81, why_gravity),
         pair(OFFSET, 0.82, NO_CERTAIN_LEAD),
     ]
     gravity, fitted = judged[GRAVITY]
@@ -144,6 +146,17 @@ def test_what_all_paths_have_second_is_not_added_where_it_does_not_pass(problem)
     assert not first.passes
 
 
+@pytest.mark.parametrize("why", ["not significant (corrected p = 1)", "first in only 60 %"])
+def test_a_path_whose_first_fails_another_gate_is_not_taken_for_its_few_parameters(
+    problem, monkeypatch, why
+):
+    monkeypatch.setattr("garat_jax.diagnosis.judge.is_above", lambda *of: False)
+    like = {"like_gravity": (named(OFFSET),), "like_second": (named(DAMPING),)}
+    seconds = {OFFSET: 0.3}, {FRICTION: 0.301}
+    _, added = chosen(problem, *seconds, PASSES, more=(FRICTION,), why_gravity=why, **like)
+    assert added == [named(DAMPING)]
+
+
 @pytest.mark.parametrize("leaves_noise", [True, False])
 def test_of_paths_that_leave_no_more_than_noise_the_one_with_the_fewest_parameters_counts(
     problem, monkeypatch, leaves_noise
@@ -151,7 +164,7 @@ def test_of_paths_that_leave_no_more_than_noise_the_one_with_the_fewest_paramete
     """Gravity and friction do what damping and an offset do, with a parameter less."""
     monkeypatch.setattr("garat_jax.diagnosis.judge.is_above", lambda *of: not leaves_noise)
     like = {"like_gravity": (named(OFFSET),), "like_second": (named(DAMPING),)}
-    _, added = chosen(problem, {OFFSET: 0.3}, {FRICTION: 0.301}, PASSES, more=(OFFSET,), **like)
+    _, added = chosen(problem, {OFFSET: 0.3}, {FRICTION: 0.301}, PASSES, more=(FRICTION,), **like)
     assert added == ([named(GRAVITY), named(FRICTION)] if leaves_noise else [named(DAMPING)])
 
 

@@ -16,6 +16,7 @@ from garat_jax.diagnosis.judge import (
     _at_end,
     is_certain,
     judge,
+    simplest,
 )
 from garat_jax.diagnosis.metric import make_metric, noise_floor
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS
@@ -188,3 +189,29 @@ def test_a_value_that_is_a_bound_but_for_rounding_is_the_bound():
     assert _at_end(phase, 1e-12) == phase.nominal
     inside = phase.high - 1e-6
     assert _at_end(phase, inside) == inside
+
+
+def test_of_fits_that_leave_no_more_than_noise_the_simplest_that_is_not_led_counts(
+    problem, monkeypatch
+):
+    metric = make_metric(problem)
+    start = settle(problem, problem.simulator.base, problem.segments.start)
+    floor = noise_floor(problem, metric, start)
+    monkeypatch.setattr("garat_jax.diagnosis.judge.noise_floor", lambda *of: floor)
+    noise = np.random.default_rng(0).normal(size=start.residual.shape)
+    times = np.max(metric.by_signal(noise, ~problem.fitted) / floor.by_signal)
+
+    def leaving(left: float, num_free: int):
+        residual = left / times * noise  # `left` times the floor, of one of the signals
+        return dataclasses.replace(start, residual=residual, free=tuple(range(num_free)))
+
+    best, as_rich = leaving(1.0, 3), leaving(1.0, 3)
+    simple, simpler, worse = leaving(1.01, 2), leaving(1.02, 1), leaving(1.015, 1)
+    led, loud = leaving(1.05, 1), leaving(1.15, 1)
+    loud.residual[problem.fitted] *= 0.1  # not led, but above the floor where it counts
+    assert simplest(problem, metric, best, [as_rich]) is best
+    assert simplest(problem, metric, best, [simple, best]) is simple
+    assert simplest(problem, metric, best, [simple, simpler]) is simpler
+    assert simplest(problem, metric, best, [simpler, worse]) is worse
+    assert simplest(problem, metric, best, [led]) is best  # by 10 % of the squares
+    assert simplest(problem, metric, best, [loud]) is best

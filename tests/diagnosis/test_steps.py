@@ -134,24 +134,28 @@ def test_an_effect_gives_way_to_what_comes_first_only_beside_what_was_found_sinc
     assert current.theta[DRAG] == 0.0
 
 
-@pytest.mark.parametrize("at_floor", [True, False])
+@pytest.mark.parametrize(
+    ("at_floor", "why", "gives_way"),
+    [(True, "", True), (True, BEHIND, True), (False, "", False), (True, "not significant", False)],
+)
 def test_an_effect_gives_way_to_one_that_leaves_as_little_with_fewer_parameters(
-    problem, monkeypatch, at_floor
+    problem, monkeypatch, at_floor, why, gives_way
 ):
     """The back EMF does what the damping does; that is given the motor's gain as well here."""
     monkeypatch.setattr("garat_jax.diagnosis.judge.is_above", lambda *of: not at_floor)
     score = Score(DAMPING, (DAMPING, GAIN), (0.0, 1.0), {}, 0.5, 0.0, True, np.zeros(0))
     own = Contender(score, fit_with(problem, DAMPING, GAIN))
     both = fit_with(problem, DAMPING, GAIN, OFFSET)
-    first = Step(candidate(DAMPING), own, own.fit, [(candidate(EMF), contender(problem, EMF))])
+    other = dataclasses.replace(candidate(EMF), passes=not why, why=why)
+    first = Step(candidate(DAMPING), own, own.fit, [(other, contender(problem, EMF))])
     later = Step(candidate(OFFSET), contender(problem, OFFSET), both, [])
     metric = make_metric(problem)
     found, current = reconsider(problem, metric, [first, later], both, lambda line: None)
-    assert found[0].effect == (EMF if at_floor else DAMPING)
-    assert {*current.free} == ({EMF, OFFSET} if at_floor else {DAMPING, GAIN, OFFSET})
-    assert found[0].candidate.why.startswith("fits as well as viscous_damping") == at_floor
-    other = Named("viscous_damping", AT) if at_floor else Named("back_emf", MOTOR)
-    assert other in found[0].candidate.indistinguishable_from
+    assert found[0].effect == (EMF if gives_way else DAMPING)
+    assert {*current.free} == ({EMF, OFFSET} if gives_way else {DAMPING, GAIN, OFFSET})
+    assert found[0].candidate.why.startswith("fits as well as viscous_damping") == gives_way
+    named = Named("viscous_damping", AT) if gives_way else Named("back_emf", MOTOR)
+    assert named in found[0].candidate.indistinguishable_from
 
 
 def test_an_effect_does_not_give_way_to_what_another_excludes(problem, monkeypatch):
