@@ -4,7 +4,6 @@ A law is superfluous, too, where another at its place that refines it can do all
 """
 
 import dataclasses
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -28,13 +27,14 @@ from garat_jax.diagnosis.judge import ANOTHER_MAY_HELP, Judged, judge, leads, si
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, noise_floor
 from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.screen import screen
+from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, screen
 from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import Fit
 from garat_jax.effects import are_exclusive
 
 NEWCOMERS = 2
-"""Candidates fitted in an earlier effect's place, of those that screening puts before it by now."""
+"""Candidates fitted in an earlier effect's place, of those that screening puts before it by now,
+and of the others that do the same there with no more parameters."""
 EQUALS = 3
 """Largest number of what is not told from the effects that were added that is fitted instead."""
 
@@ -113,7 +113,8 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
 
     By itself an effect may lead for what it says of another, which was missing yet; beside that
     one, recordings may tell apart what they could not, and may no longer what they did. It is held
-    against what did much the same then, and against what would come first now. One that fits better
+    against what did much the same then, and against what would come first or do the same now; the
+    last, too, where one before it was replaced. One that fits better
     by now, or as well with fewer parameters, comes in its place, and what was added since may only
     have made up for the wrong one.
 
@@ -122,7 +123,9 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
         all of them.
     """
     found, fitted = [*steps], current
-    for place, step in enumerate(steps[:-1]):
+    for place, step in enumerate(steps):
+        if step is steps[-1] and fitted is current:  # it was held against others beside these
+            break
         others = [s.effect for s in found if s.effect != step.effect]
         trials = []
         for candidate, contender in step.alike:
@@ -180,12 +183,15 @@ def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others
     scores = screen(problem, without, others)
     tried = {step.effect, *(contender.score.effect for _, contender in step.alike)}
     known = [score for score in scores if score.effect in tried]
-    ahead = itertools.takewhile(lambda score: score.effect != step.effect, scores)
-    ahead = [s for s in ahead if s.possible and s.effect not in tried and not twins(s, known)]
-    ahead = [s for s in ahead if not refines(problem, s.effect, step.effect)]
-    ahead = [s for i, s in enumerate(ahead) if not twins(s, ahead[:i])][:NEWCOMERS]
+    new = [s for s in scores if s.possible and s.effect not in tried and not twins(s, known)]
+    new = [s for s in new if not refines(problem, s.effect, step.effect)]
+    new = [s for i, s in enumerate(new) if not twins(s, new[:i])]
+    place = {score.effect: i for i, score in enumerate(scores)}
+    ahead = [s for s in new if place[s.effect] < place.get(step.effect, len(scores))][:NEWCOMERS]
+    rest = [s for s in new if all(s is not other for other in ahead)]
+    alike = [s for s in rest if _does_as_much(s, step, known)][:NEWCOMERS]
     rival = fitted.cost[problem.fitted].sum()
-    new = [fit_one(problem, without, score, rival, say) for score in ahead]
+    new = [fit_one(problem, without, score, rival, say) for score in (*ahead, *alike)]
     new = with_twins(problem, without, scores, new, say)
     new += [Contender(score, fitted) for score in scores if new and score.effect == step.effect]
     num_tests = len([score for score in scores if not score.excluded])
@@ -193,6 +199,12 @@ def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others
     floor = noise_floor(problem, metric, fitted)
     judged = judge(problem, metric, without, scores, new, floor)
     return [(c, k) for c, k in judged if k and k.score.effect != step.effect]
+
+
+def _does_as_much(score: Score, step: Step, known: Sequence[Score]) -> bool:
+    """Say whether a candidate does what a step does, as screened, with no more parameters."""
+    own = [s for s in known if s.effect == step.effect and len(s.columns) >= len(score.columns)]
+    return any(cosine(score, s) > EQUIVALENT for s in own)
 
 
 def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, say):
