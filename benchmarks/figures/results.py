@@ -35,11 +35,17 @@ def origin(name: str, result: dict[str, Any]) -> str:
     )
 
 
-def commits(rows: Sequence[dict[str, Any]]) -> str:
-    """Say of which commits rows, or parts of a row, are, where they are of several."""
+def commits(rows: Sequence[dict[str, Any]], own: str = "") -> str:
+    """Say of which commits rows, or parts of a row, are, where not all are of the file's own."""
     every = [commit for row in rows for commit in row.get("commits", [row.get("commit")])]
     found = sorted({commit[:7] for commit in every if commit})
-    return f"\nThe rows are of the commits {', '.join(found)}.\n" if len(found) > 1 else ""
+    if len(found) > 1:
+        return f"\nThe rows are of the commits {', '.join(found)}.\n"
+    return (
+        f"\nThe rows are of the commit {found[0]}.\n"
+        if own and found not in ([], [own[:7]])
+        else ""
+    )
 
 
 def if_measured(make: Callable[[dict[str, Any]], str], name: str, part: str = "rows") -> str:

@@ -156,7 +156,8 @@ def hidden_effects(seed: int, category: str = "") -> str:
         f"{seconds['largest']:.0f} s. The result file names the sets that fall short.\n"
     )
     columns = ("measure", "share", "95 % interval", "of", "held to")
-    return table(columns, lines) + text + commits(result["rows"]) + origin(name, result)
+    of = commits(result["rows"], result["git"]["commit"])
+    return table(columns, lines) + text + of + origin(name, result)
 
 
 def hidden_effects_others(seeds: tuple[int, ...]) -> str:
@@ -339,6 +340,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "optimisation_level": optimisation_level,
     "profiling_clock": profiling_clock,
     "hidden_effects": functools.partial(hidden_effects, 12),
+    "hidden_effects_pairs": functools.partial(hidden_effects, 14, "pair"),
     "hidden_effects_others": functools.partial(hidden_effects_others, (11, 10, 9, 8, 7, 6, 5, 4)),
     "timing": timing,
     "real_data": real_data,
