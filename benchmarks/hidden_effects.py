@@ -196,7 +196,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="tune on 0, report on others")
     parser.add_argument("--only", nargs="+", metavar="TEXT", help="cases whose name holds a text")
-    parser.add_argument("--category", choices=score.CATEGORIES, help="only sets of this")
+    parser.add_argument("--category", choices=score.CATEGORIES, help="only its sets")
     parser.add_argument("--robots", nargs="+", choices=list(ROBOTS), default=list(ROBOTS))
     parser.add_argument("--sample", type=int, metavar="N", help="the first N of a random order")
     parser.add_argument("--extend", action="store_true", help="keep the rows of the result file")

@@ -69,9 +69,9 @@ class Path(NamedTuple):
         return any(named in (c.named, *c.indistinguishable_from) for c in self.added)
 
     def is_as_sure_as(self, other: "Path") -> bool:
-        """Say whether the first lacks at most what a second mends, the second at most the other's.
+        """Say whether its first fails no gate but those that another effect may mend.
 
-        Both paths have a second.
+        And its second passes if that of the other path does.
         """
         lacks_little = self.candidate.passes or self.candidate.why in ANOTHER_MAY_HELP
         return lacks_little and (self.then[0][0].passes or not other.then[0][0].passes)
@@ -104,11 +104,10 @@ def choose(
 
     Returns:
         The candidates, the first of which passes if with another it leads its rivals with another
-        (or does as well with fewer parameters),
-        or if all that these do not lead add it, too, or the same beside another first; and what is
-        to be added: the first if it passes, with the other if it needs that and no third explains
-        as much; a next round may tell these. Where nothing is held and nothing passes so, several
-        that explain all, if each is needed.
+        (or does as well with fewer parameters), or if all that these do not lead add it, too, or
+        the same beside another first; and what is to be added: the first if it passes, with the
+        other if it needs that and no third explains as much; a next round may tell these. Where
+        nothing is held and nothing passes so, several that explain all, if each is needed.
     """
     followed = []
     for candidate, contender in _rivals(problem, metric, judged, len(held))[: 1 + RIVALS]:

@@ -15,10 +15,11 @@ SIZES = (256, 1024)
 """Simulations in a batch. Whole segments in one call need no more than the first; where a call is a
 substep, many simulations share its cost. Each size is compiled once."""
 SMALL = 32
-"""Simulations in the smaller batches of programs with as many substeps as `LONG`. Few segments are
-followed there at a time, and the rows of a batch of 256 that are not used cost a fifth of it."""
+"""Simulations in a batch where no more are needed and segments are `LONG`, as a fit at a finer
+timestep to a few of them. Of a batch of 256 the rows that are not used cost a fifth."""
 LONG = 4000
-"""Substeps of a segment, each a call, from which that pays for compiling another size."""
+"""Substeps of a segment, most of them calls, from which a program is compiled for `SMALL` and the
+first of `SIZES` instead."""
 
 
 class Program(NamedTuple):

@@ -33,8 +33,8 @@ from garat_jax.diagnosis.starts import Fit
 from garat_jax.effects import are_exclusive
 
 NEWCOMERS = 2
-"""Candidates fitted in an earlier effect's place, of those that screening puts before it by now,
-and of the others that do the same there with no more parameters."""
+"""Candidates fitted in an effect's place, of those that screening puts before it by now; and as
+many of the others that do the same there with no more parameters."""
 EQUALS = 3
 """Largest number of what is not told from the effects that were added that is fitted instead."""
 
@@ -114,9 +114,9 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
     By itself an effect may lead for what it says of another, which was missing yet; beside that
     one, recordings may tell apart what they could not, and may no longer what they did. It is held
     against what did much the same then, and against what would come first or do the same now; the
-    last, too, where one before it was replaced. One that fits better
-    by now, or as well with fewer parameters, comes in its place, and what was added since may only
-    have made up for the wrong one.
+    last, too, where one before it was replaced. One that fits better by now, or as well with fewer
+    parameters, comes in its place, and what was added since may only have made up for the wrong
+    one.
 
     Returns:
         The steps, each with those that the recordings do not tell from it now, and the fit with
@@ -124,7 +124,7 @@ def reconsider(problem: Problem, metric: Metric, steps: list[Step], current: Fit
     """
     found, fitted = [*steps], current
     for place, step in enumerate(steps):
-        if step is steps[-1] and fitted is current:  # it was held against others beside these
+        if step is steps[-1] and fitted is current:  # nothing before it gave way
             break
         others = [s.effect for s in found if s.effect != step.effect]
         trials = []
@@ -173,7 +173,7 @@ def _excludes(problem: Problem, contender: Contender, others: Sequence[int]) -> 
 
 
 def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others, say) -> Judged:
-    """Fit what screening would put before a step now, in its place, if that was not tried yet.
+    """Fit what was not tried in a step's place and screening puts before it now, or like it.
 
     Returns:
         What was fitted, judged beside the step's own effect.
@@ -189,7 +189,7 @@ def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others
     place = {score.effect: i for i, score in enumerate(scores)}
     ahead = [s for s in new if place[s.effect] < place.get(step.effect, len(scores))][:NEWCOMERS]
     rest = [s for s in new if all(s is not other for other in ahead)]
-    alike = [s for s in rest if _does_as_much(s, step, known)][:NEWCOMERS]
+    alike = [s for s in rest if _does_as_much(problem, s, step, fitted, known)][:NEWCOMERS]
     rival = fitted.cost[problem.fitted].sum()
     new = [fit_one(problem, without, score, rival, say) for score in (*ahead, *alike)]
     new = with_twins(problem, without, scores, new, say)
@@ -201,10 +201,11 @@ def _newcomers(problem: Problem, metric: Metric, step: Step, fitted: Fit, others
     return [(c, k) for c, k in judged if k and k.score.effect != step.effect]
 
 
-def _does_as_much(score: Score, step: Step, known: Sequence[Score]) -> bool:
+def _does_as_much(problem: Problem, score: Score, step: Step, fitted: Fit, known) -> bool:
     """Say whether a candidate does what a step does, as screened, with no more parameters."""
-    own = [s for s in known if s.effect == step.effect and len(s.columns) >= len(score.columns)]
-    return any(cosine(score, s) > EQUIVALENT for s in own)
+    own = {*columns_of(problem.simulator.slots, step.effect).values()} & {*fitted.free}
+    like = [other for other in known if other.effect == step.effect and not other.excluded]
+    return len(score.columns) <= len(own) and any(cosine(score, s) > EQUIVALENT for s in like)
 
 
 def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, say):
@@ -213,16 +214,18 @@ def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, 
     That is what certainly fits better, or what does as well with fewer parameters.
     """
     better = [pair for pair in trials if _is_better(problem, pair[1].fit, fitted)]
-    likely = better or [c for c in trials if c[0].passes or c[0].why in ANOTHER_MAY_HELP]
+    simpler = [pair for pair in trials if _may_do_as_well(pair, fitted)]
     best = min((k.fit for _, k in better), key=lambda fit: fit.cost.sum(), default=fitted)
-    best = simplest(problem, metric, best, [contender.fit for _, contender in likely])
-    for pair in [pair for pair in likely if pair[1].fit is best]:
-        instead = complete(problem, pair[1], say) if better else pair[1]
+    best = simplest(problem, metric, best, [k.fit for _, k in (*better, *simpler)])
+    pair = next((pair for pair in (*better, *simpler) if pair[1].fit is best), None)
+    if pair is not None:
+        fits_better = any(pair is other for other in better)
+        instead = complete(problem, pair[1], say) if fits_better else pair[1]
         trials = [other for other in trials if other is not pair]
         trials.append((step.candidate, dataclasses.replace(step.contender, fit=fitted)))
         alike = [(step.candidate, step.contender)]
         alike += [other for other in step.alike if other[0] is not pair[0]]
-        how = "fits better than {}" if better else "fits as well as {} with fewer parameters,"
+        how = "fits better than {}" if fits_better else "fits as well as {} with fewer parameters,"
         why = f"{how.format(step.candidate.named)} beside what was found since"
         candidate = dataclasses.replace(pair[0], passes=True, why=why)
         step, fitted = Step(candidate, instead, instead.fit, alike), instead.fit
@@ -234,6 +237,16 @@ def _best_of(problem: Problem, metric: Metric, step: Step, fitted: Fit, trials, 
     ]
     candidate = dataclasses.replace(step.candidate, indistinguishable_from=tuple(equals))
     return step._replace(candidate=candidate), fitted
+
+
+def _may_do_as_well(pair: tuple[Candidate, Contender], fitted: Fit) -> bool:
+    """Say whether a trial has fewer parameters, and failed no gate but one that another may mend.
+
+    That is what was said of it when it came up.
+    """
+    candidate, contender = pair
+    lacks_little = candidate.passes or candidate.why in ANOTHER_MAY_HELP
+    return lacks_little and len(contender.fit.free) < len(fitted.free)
 
 
 def _is_equal(problem: Problem, metric: Metric, floor: Floor, fitted: Fit, other: Fit) -> bool:

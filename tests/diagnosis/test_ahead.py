@@ -45,6 +45,7 @@ def chosen(
     like_second: tuple[Named, ...] = (),
     more: tuple[int, ...] = (),
     why_gravity: str = NO_CERTAIN_LEAD,
+    why_beside_gravity: str | None = None,
 ):
     """Choose where damping, gravity and an offset explain 20, 19 and 18 % each by itself.
 
@@ -58,6 +59,7 @@ def chosen(
         like_gravity: What is not told from gravity.
         like_second: What is not told from the best effect beside gravity.
         why_gravity: What is said of gravity.
+        why_beside_gravity: What is said of the best effect beside it, if not `why`.
         more: Parameters that are free beside damping, besides its own and the best effect's.
     """
     current = settle(problem, problem.simulator.base, problem.segments.start)
@@ -80,7 +82,9 @@ def chosen(
         beside = seconds.get(contender.score.effect)
         if beside is None:
             return [pair(DAMPING, 0.8, NO_CERTAIN_GAIN)]
-        second = [pair(effect, left, why) for effect, left in beside.items()]
+        is_gravity = contender.score.effect == GRAVITY
+        said = why_beside_gravity if is_gravity and why_beside_gravity else why
+        second = [pair(effect, left, said) for effect, left in beside.items()]
         if contender.score.effect == DAMPING:
             return [(c, _with_more_free(k, more)) for c, k in second]
         alike = [dataclasses.replace(c, indistinguishable_from=like_second) for c, _ in second]
@@ -146,14 +150,20 @@ def test_what_all_paths_have_second_is_not_added_where_it_does_not_pass(problem)
     assert not first.passes
 
 
-@pytest.mark.parametrize("why", ["not significant (corrected p = 1)", "first in only 60 %"])
-def test_a_path_whose_first_fails_another_gate_is_not_taken_for_its_few_parameters(
-    problem, monkeypatch, why
+@pytest.mark.parametrize(
+    "less_sure",
+    [
+        {"why_gravity": "not significant (corrected p = 1)"},
+        {"why_beside_gravity": NO_CERTAIN_LEAD},
+    ],
+)
+def test_a_path_that_is_less_sure_is_not_taken_for_its_few_parameters(
+    problem, monkeypatch, less_sure
 ):
     monkeypatch.setattr("garat_jax.diagnosis.judge.is_above", lambda *of: False)
     like = {"like_gravity": (named(OFFSET),), "like_second": (named(DAMPING),)}
     seconds = {OFFSET: 0.3}, {FRICTION: 0.301}
-    _, added = chosen(problem, *seconds, PASSES, more=(FRICTION,), why_gravity=why, **like)
+    _, added = chosen(problem, *seconds, PASSES, more=(FRICTION,), **less_sure, **like)
     assert added == [named(DAMPING)]
 
 

@@ -206,12 +206,12 @@ def test_of_fits_that_leave_no_more_than_noise_the_simplest_that_is_not_led_coun
         return dataclasses.replace(start, residual=residual, free=tuple(range(num_free)))
 
     best, as_rich = leaving(1.0, 3), leaving(1.0, 3)
-    simple, simpler, worse = leaving(1.01, 2), leaving(1.02, 1), leaving(1.015, 1)
+    simple, simpler, nearer = leaving(1.01, 2), leaving(1.02, 1), leaving(1.015, 1)
     led, loud = leaving(1.05, 1), leaving(1.15, 1)
     loud.residual[problem.fitted] *= 0.1  # not led, but above the floor where it counts
     assert simplest(problem, metric, best, [as_rich]) is best
     assert simplest(problem, metric, best, [simple, best]) is simple
     assert simplest(problem, metric, best, [simple, simpler]) is simpler
-    assert simplest(problem, metric, best, [simpler, worse]) is worse
+    assert simplest(problem, metric, best, [simpler, nearer]) is nearer
     assert simplest(problem, metric, best, [led]) is best  # by 10 % of the squares
     assert simplest(problem, metric, best, [loud]) is best

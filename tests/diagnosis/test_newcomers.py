@@ -19,6 +19,8 @@ from tests.diagnosis.test_steps import (
     GAIN,
     OFFSET,
     added,
+    candidate,
+    contender,
     damped_and_pulled,
     reconsidered,
 )
@@ -37,6 +39,16 @@ def test_the_last_is_held_against_others_once_more_where_one_before_it_gave_way(
     reconsider(problem, make_metric(problem), steps, steps[-1].fit, said.append)
     again = f"looking for what would explain more than {Named('torque_offset', AT)}"
     assert (again in said) == is_replaced
+
+
+def test_the_last_gives_way_as_well(problem):
+    """The pull comes in the gain's place, and then the damping in that of the drag."""
+    steps = added(problem, GAIN, OFFSET, DRAG)
+    steps[-1] = steps[-1]._replace(alike=[(candidate(DAMPING), contender(problem, DAMPING))])
+    found, current = reconsider(problem, make_metric(problem), steps, steps[-1].fit, [].append)
+    assert [step.effect for step in found] == [OFFSET, DAMPING]
+    assert {*current.free} == {OFFSET, DAMPING}
+    assert found[-1].fit is current
 
 
 @pytest.mark.parametrize("num_parameters", [1, 2])
