@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
@@ -29,6 +32,7 @@ from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
 from garat_jax.effects import CATALOGUE
 
+REPOSITORY = Path(__file__).parent.parent
 SCENES = Surveys()
 TIME = np.arange(60) / 200.0
 
@@ -308,6 +312,24 @@ def scored(truth, *selected, verdict="missing_effect"):
         seconds=1.0,
     )
     return score(found, truth, SCENES["arm2"].model)
+
+
+def test_a_category_is_kept_in_a_file_of_its_own():
+    command = [sys.executable, "benchmarks/hidden_effects.py", "--seed", "14", "--extend"]
+    command += ["--category", "pair", "--sample", "1"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "--extend would drop 19 recorded sets" in done.stderr
+
+
+def test_what_no_set_is_asked_has_no_share():
+    row = {"case": "pair-00", "status": "done", "category": "pair", "seconds": 1.0, "found": True}
+    lines = {line["measure"]: line for line in aggregate([row])}
+    assert (lines["clean, nothing claimed"]["value"], lines["pairs, both found"]["count"]) == (
+        None,
+        1,
+    )
+    assert "interval" not in lines["clean, nothing claimed"]
 
 
 def test_several_estimates_of_a_set_do_not_narrow_the_interval():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import record
+from benchmarks.figures.results import commits
 from benchmarks.record import command_line, write_result
 
 
@@ -54,3 +55,17 @@ def test_the_command_is_recorded_without_where_the_result_goes(monkeypatch):
     words = ["/somewhere/benchmarks/speed.py", "--out", "/elsewhere", "--envs", "hopper"]
     monkeypatch.setattr("sys.argv", words)
     assert command_line() == "python benchmarks/speed.py --envs hopper"
+
+
+@pytest.mark.parametrize(
+    ("of_rows", "own", "said"),
+    [
+        (["a", "b"], "a", "The rows are of the commits a, b."),
+        (["b", "b"], "a", "The rows are of the commit b."),
+        (["a", None], "a", ""),
+        ([None], "a", ""),
+    ],
+)
+def test_tables_say_where_rows_are_of_other_commits_than_their_file(of_rows, own, said):
+    rows = [{"commit": commit} for commit in of_rows]
+    assert commits(rows, own).strip() == said

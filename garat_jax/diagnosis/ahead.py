@@ -20,6 +20,7 @@ from garat_jax.diagnosis.judge import (
     held_out_gain,
     is_certain,
     leads,
+    may_be_mended,
     simplest,
 )
 from garat_jax.diagnosis.metric import AT_FLOOR, Metric, is_above, noise_floor
@@ -73,8 +74,8 @@ class Path(NamedTuple):
 
         And its second passes if that of the other path does.
         """
-        lacks_little = self.candidate.passes or self.candidate.why in ANOTHER_MAY_HELP
-        return lacks_little and (self.then[0][0].passes or not other.then[0][0].passes)
+        is_sure_then = self.then[0][0].passes or not other.then[0][0].passes
+        return may_be_mended(self.candidate) and is_sure_then
 
     def is_like(self, other: "Path") -> bool:
         """Say whether the other adds the same, or what recordings cannot tell from it."""
@@ -135,7 +136,8 @@ def _one_or_two(
     best = min(followed, key=lambda path: path.fit.cost.sum())
     if not gains(best):
         return judged, first_step(problem, judged, current)
-    sure = [path for path in followed if gains(path) and path.is_as_sure_as(best)]
+    rivals = [path for path in followed if path is not best]
+    sure = [path for path in rivals if path.is_as_sure_as(best) and gains(path)]
     simple = simplest(problem, metric, best.fit, [path.fit for path in sure])
     best = next(path for path in followed if path.fit is simple)
     others = [path for path in followed if not best.is_like(path)]
@@ -181,7 +183,7 @@ def _several(
     steps: list[Step] = []
     fit, then, is_all = current, judged, False
     while not is_all:
-        likely = [(c, k) for c, k in then if k and _may_be_one_of_several(c)]
+        likely = [(c, k) for c, k in then if k and c.share > LARGE and may_be_mended(c)]
         if not likely:
             return judged, []
         candidate, contender = likely[0]
@@ -207,11 +209,6 @@ def _several(
     first = steps[0]
     others = [(c, k) for c, k in judged if c.named != first.candidate.named]
     return [(first.candidate, first.contender), *others], steps
-
-
-def _may_be_one_of_several(candidate: Candidate) -> bool:
-    """Say whether a candidate explains much and lacks at most what other effects may drown."""
-    return candidate.share > LARGE and (candidate.passes or candidate.why in ANOTHER_MAY_HELP)
 
 
 def _is_at_floor(problem: Problem, metric: Metric, fit: Fit) -> bool:

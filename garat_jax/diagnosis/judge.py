@@ -287,6 +287,11 @@ def _unfitted(problem: Problem, score: Score, others: Sequence[Score], why: str)
     )
 
 
+def may_be_mended(candidate: Candidate) -> bool:
+    """Say whether a candidate fails no gate but one that it may pass beside another effect."""
+    return candidate.passes or candidate.why in ANOTHER_MAY_HELP
+
+
 def leads(problem: Problem, first: Fit, second: Fit, by: float = TOO_CLOSE) -> bool:
     """Say whether one fit's cost is certainly lower than another's, by more than a factor."""
     costs = block_costs(problem, 1.0, [first, second], slice(None))

@@ -23,7 +23,7 @@ from garat_jax.diagnosis.contend import (
 )
 from garat_jax.diagnosis.findings import Candidate
 from garat_jax.diagnosis.fit import fit
-from garat_jax.diagnosis.judge import ANOTHER_MAY_HELP, Judged, judge, leads, simplest
+from garat_jax.diagnosis.judge import Judged, judge, leads, may_be_mended, simplest
 from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, noise_floor
 from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem
@@ -245,8 +245,7 @@ def _may_do_as_well(pair: tuple[Candidate, Contender], fitted: Fit) -> bool:
     That is what was said of it when it came up.
     """
     candidate, contender = pair
-    lacks_little = candidate.passes or candidate.why in ANOTHER_MAY_HELP
-    return lacks_little and len(contender.fit.free) < len(fitted.free)
+    return may_be_mended(candidate) and len(contender.fit.free) < len(fitted.free)
 
 
 def _is_equal(problem: Problem, metric: Metric, floor: Floor, fitted: Fit, other: Fit) -> bool:

@@ -58,12 +58,11 @@ def test_what_does_the_same_as_an_earlier_effect_with_no_more_parameters_is_trie
     """Drag does what damping does where screened, and comes behind it."""
 
     def with_drag(*of):
-        alike = [(s, s.contribution) for s in screen(*of) if s.effect == DAMPING]
+        scores, columns = screen(*of), (DRAG, GAIN)[:num_parameters]
+        (does,) = [s.contribution for s in scores if s.effect == DAMPING]
         return [
-            dataclasses.replace(s, columns=(DRAG, GAIN)[:num_parameters], contribution=alike[0][1])
-            if s.effect == DRAG
-            else s
-            for s in screen(*of)
+            dataclasses.replace(s, columns=columns, contribution=does) if s.effect == DRAG else s
+            for s in scores
         ]
 
     monkeypatch.setattr("garat_jax.diagnosis.steps.screen", with_drag)
