@@ -282,18 +282,20 @@ def test_two_effects_that_hide_each_other_on_held_out_data_are_both_found(tmp_pa
 
 
 @pytest.mark.slow
-def test_two_effects_of_which_neither_leads_by_itself_are_found_together(tmp_path):
-    case = next(c for c in list_cases(0) if c.name == "pair-02-air_drag+load_friction")
-    truth = draw(case, SCENES)
-    paths = generate(truth, SCENES[truth.robot], tmp_path)
+@pytest.mark.parametrize(
+    ("seed", "name"),
+    [(0, "pair-02-air_drag+load_friction"), (15, "pair-01-encoder_scale+motor_deadband")],
+)
+def test_two_effects_of_which_neither_leads_by_itself_are_found_together(seed, name, tmp_path):
+    truth = draw(next(case for case in list_cases(seed) if case.name == name), SCENES)
+    *paths, last = generate(truth, SCENES[truth.robot], tmp_path)
     model = load_model(tmp_path / f"{truth.robot}.xml")
-    fitted, held_out = read_recordings(model, paths[:-1]), read_recordings(model, paths[-1:])
-    found = diagnose(model, fitted, held_out)
-    assert "together with air_drag" in found.selected[0].why
+    found = diagnose(model, read_recordings(model, paths), read_recordings(model, [last]))
+    assert f"together with {truth.secrets[0].kind}" in found.selected[0].why
     for effect, secret in zip(found.selected, reversed(truth.secrets), strict=True):
-        ((name, true),) = secret.parameters.items()
+        ((parameter, true),) = secret.parameters.items()
         assert (effect.effect, effect.target) == (secret.kind, secret.target)
-        assert effect.parameters[name].estimate == pytest.approx(true, rel=0.05)
+        assert effect.parameters[parameter].estimate == pytest.approx(true, rel=0.05)
 
 
 def candidate(effect: str, target: str, alike=(), **parameters) -> Candidate:

@@ -29,7 +29,7 @@ from garat_jax.diagnosis.starts import Fit
 from garat_jax.diagnosis.steps import Step, fit_only, prune
 
 RIVALS = 2
-"""How many candidates behind the first are followed for one more effect."""
+"""How many candidates behind the first are followed for one more effect; and one that is paired."""
 LOOK_AHEAD = 2
 """Effects held from which rivals are not followed any more: each path is a round of its own, and
 rounds take longer with every effect held."""
@@ -111,7 +111,7 @@ def choose(
         nothing is held and nothing passes so, several that explain all, if each is needed.
     """
     followed = []
-    for candidate, contender in _rivals(problem, metric, judged, len(held))[: 1 + RIVALS]:
+    for candidate, contender in _rivals(problem, metric, judged, len(held)):
         say(f"looking for what would be missing beside {candidate.named}")
         followed.append(Path(candidate, contender, follow(held, contender)))
     judged, steps = _one_or_two(problem, metric, current, judged, followed)
@@ -274,7 +274,7 @@ def _rivals(
     """Return the candidates of which another effect may make the first, with their fits.
 
     Where one passes, these are the laws that it refines, unless it leaves no more than noise. Where
-    none does, there are none beside `LOOK_AHEAD` effects.
+    none does, there are none beside `LOOK_AHEAD` effects. One that is paired is among them, too.
     """
     fitted = [(candidate, contender) for candidate, contender in judged if contender]
     for first, contender in fitted[:1]:
@@ -282,9 +282,13 @@ def _rivals(
             floor = noise_floor(problem, metric, contender.fit)
             is_open = is_above(problem, metric, contender.fit, floor, AT_FLOOR)
             own = contender.score.effect
-            return [(c, k) for c, k in fitted if is_open and refines(problem, own, k.score.effect)]
+            simpler = [(c, k) for c, k in fitted if refines(problem, own, k.score.effect)]
+            paired = [(c, k) for c, k in fitted[1:] if k.is_paired]
+            return [*simpler[: 1 + RIVALS], *paired] if is_open else []
         if first.why in ANOTHER_MAY_HELP and num_held < LOOK_AHEAD:
-            return _one_of_each(fitted)
+            likely = _one_of_each(fitted)
+            paired = [(c, k) for c, k in likely[1 + RIVALS :] if k.is_paired]
+            return [*likely[: 1 + RIVALS], *paired]
     return []
 
 

@@ -40,11 +40,13 @@ class Contender:
         score: What screening said, with the fit's p-value once it was tested.
         fit: All selected effects and this one, fitted.
         timeless: As a timestep of 0 would have it, where that was measured.
+        is_paired: Whether it and another may explain far more together; see `together`.
     """
 
     score: Score
     fit: Fit
     timeless: Fit | None = None
+    is_paired: bool = False
 
 
 def fit_contenders(
@@ -75,9 +77,8 @@ def fit_contenders(
         rival = min((c.fit.cost[problem.fitted].sum() for c in contenders), default=np.inf)
         hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
-        if hopeless and not alike and len(contenders) > 1:
-            continue
-        contenders.append(fit_one(problem, current, score, rival, say))
+        if not hopeless or alike or len(contenders) < 2:
+            contenders.append(fit_one(problem, current, score, rival, say))
     return contenders + _fit_alike(problem, current, likely, contenders, say)
 
 
@@ -232,7 +233,7 @@ def fit_further(
     start, sensitivity = contender.fit.start, contender.fit.sensitivity
     fitted = fit(problem, contender.fit.theta, start, free, sensitivity=sensitivity)
     score = dataclasses.replace(contender.score, columns=(*contender.score.columns, *further))
-    return [Contender(score, fitted)]
+    return [dataclasses.replace(contender, score=score, fit=fitted, timeless=None)]
 
 
 def complete(problem: Problem, best: Contender, say: Callable[[str], None]) -> Contender:
@@ -322,9 +323,8 @@ def _as_twin(problem: Problem, current: Fit, twin: Contender, like: Score, score
     if np.any(problem.within_bounds(columns, values) != values):
         return None
     fitted = renamed(twin.fit, twin.score.columns, columns, without=current.theta)
-    if not is_predicted(problem, fitted):
-        return None
-    return Contender(dataclasses.replace(score, columns=columns), fitted)
+    same = Contender(dataclasses.replace(score, columns=columns), fitted)
+    return same if is_predicted(problem, fitted) else None
 
 
 def under_another_name(

@@ -16,6 +16,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rivals import fill_out, refine
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import Fit
+from garat_jax.diagnosis.together import with_paired
 
 FOLLOWED = 2
 """Candidates that are fitted beside each rival that is followed for one more effect."""
@@ -48,6 +49,8 @@ def run_round(
     gap = is_above(problem, metric, current, floor, above)
     scores = screen(problem, current, held)
     contenders = fit_contenders(problem, current, refinable, scores, say, num) if gap else []
+    if num == CONTENDERS:
+        contenders = with_paired(problem, current, scores, contenders, say)
     contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
     contenders = refine(problem, metric, current, scores, contenders, floor, say)
     contenders = fill_out(problem, metric, contenders, floor, say)

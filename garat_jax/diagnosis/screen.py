@@ -58,6 +58,7 @@ class Score:
         possible: Whether the expected values are physically possible.
         contribution: Its part of the predictions on the fitted data, [M].
         excluded: Why it cannot be judged; empty if it can.
+        changes: What each of its parameters changes there, [M, k], where it can.
     """
 
     effect: int
@@ -69,6 +70,7 @@ class Score:
     possible: bool
     contribution: np.ndarray
     excluded: str = ""
+    changes: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
 
 
 def screen(problem: Problem[Simulator], fit: Fit, skip: Sequence[int] = ()) -> list[Score]:
@@ -219,7 +221,8 @@ def _score(
     size, start, possible = _size(problem.simulator, rows, trial, chosen, factor)
     p_value = min(1.0, problem.num_tried(trial.effect) * evidence.p_value(trial.effect, matrix))
     columns = tuple(rows[i].column for i in chosen)
-    return Score(trial.effect, columns, size, start, share, p_value, possible, contribution)
+    what = (trial.effect, columns, size, start, share, p_value, possible, contribution)
+    return Score(*what, changes=weighted)
 
 
 def _size(simulator: Simulator, rows: list[Row], trial: Trial, chosen: list[int], factor):

@@ -113,6 +113,42 @@ def named(effect: int) -> Named:
     return Named(EFFECTS[effect].kind, EFFECTS[effect].target)
 
 
+def followed(problem, why_first: str, paired: int) -> list[int]:
+    """Return from which of four candidates is looked ahead, of which one is paired."""
+    current = settle(problem, problem.simulator.base, problem.segments.start)
+
+    def pair(effect: int) -> tuple[Candidate, Contender]:
+        law, none = EFFECTS[effect], Interval(0.0, 0.0, 0.0)
+        why = why_first if effect == DAMPING else NO_CERTAIN_LEAD
+        what = (law.kind, law.target, {}, 0.1, 0.0, 0.0, none, 0.5, (), why == PASSES, why)
+        score = Score(effect, (effect,), (0.1,), {}, 0.9, 1e-9, True, np.zeros(0))
+        return Candidate(*what), Contender(score, current, is_paired=effect == paired)
+
+    seen = []
+
+    def follow(held, contender: Contender):
+        seen.append(contender.score.effect)
+        return []
+
+    judged = [pair(effect) for effect in range(len(EFFECTS))]
+    choose(problem, make_metric(problem), current, judged, [], follow, [].append)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("why_first", "paired", "expected"),
+    [
+        (NO_CERTAIN_LEAD, -1, [DAMPING, GRAVITY, OFFSET]),
+        (NO_CERTAIN_LEAD, FRICTION, [DAMPING, GRAVITY, OFFSET, FRICTION]),
+        (NO_CERTAIN_LEAD, GRAVITY, [DAMPING, GRAVITY, OFFSET]),
+        (PASSES, FRICTION, [FRICTION]),
+        (PASSES, DAMPING, []),
+    ],
+)
+def test_what_is_paired_is_looked_ahead_from_as_well(problem, why_first, paired, expected):
+    assert followed(problem, why_first, paired) == expected
+
+
 def test_a_path_that_leads_the_others_makes_its_first_pass(problem):
     first, added = chosen(problem, {OFFSET: 0.3}, {OFFSET: 0.5})
     assert added == [named(DAMPING)]
