@@ -21,7 +21,9 @@ from garat_jax.effects import are_exclusive
 
 FAR_LESS = 0.5
 """What two are expected to leave of the residual, relative to what the best candidate left when it
-was fitted, from which one of them is looked ahead from."""
+was fitted, below which the stronger is followed for the other."""
+SAME = 1e-6
+"""Square of the part of a direction that another candidate lacks, below which there is none."""
 
 
 class Pair(NamedTuple):
@@ -41,30 +43,40 @@ def best_pair(problem: Problem, scores: Sequence[Score]) -> Pair | None:
     """
     likely = [score for score in scores if score.possible and score.share > LIKELY]
     likely.sort(key=lambda score: -score.share)
+    if len(likely) < 2:
+        return None
     bases = [orthonormal(score.changes) for score in likely]
-    along = [basis.T @ s.contribution for basis, s in zip(bases, likely, strict=True)]
+    ends = np.cumsum([basis.shape[1] for basis in bases])
+    own = np.split(np.arange(ends[-1]), ends[:-1])
+    every = np.concatenate(bases, axis=1)
+    common = every.T @ every
+    along = np.stack([every.T @ score.contribution for score in likely])
     pairs = [
-        Pair(likely[i], likely[j], _share(likely[i], bases[i], bases[j], along[j]))
+        Pair(likely[i], likely[j], _share(likely[i], along[i], along[j], own[i], own[j], common))
         for i, j in itertools.combinations(range(len(likely)), 2)
         if _are_two(problem, likely[i], likely[j])
     ]
     return max(pairs, key=lambda pair: pair.share, default=None)
 
 
-def _share(one: Score, basis: np.ndarray, other: np.ndarray, along: np.ndarray) -> float:
+def _share(
+    one: Score, along: np.ndarray, other: np.ndarray, own: np.ndarray, others: np.ndarray, common
+) -> float:
     """Return the share that a candidate and another explain together.
 
     Args:
         one: The candidate.
-        basis: What it changes, orthonormal, [M, k].
-        other: What the other changes, orthonormal, [M, l].
-        along: How much of that the other explains by itself, [l].
+        along: How much of every direction it explains, [n].
+        other: How much of them the other explains, [n].
+        own: Which directions are its own, orthonormal, [k].
+        others: Which are the other's, [l].
+        common: Of every two directions, how much they are the same, [n, n].
     """
-    common = basis.T @ other
-    rest = along - common.T @ (basis.T @ one.contribution)
-    square, ways = np.linalg.eigh(np.eye(len(rest)) - common.T @ common)
-    more = np.sum((ways.T @ rest) ** 2 * (square > 1e-6) / np.maximum(square, 1e-6))
-    return one.share * (1.0 + float(more) / float(one.contribution @ one.contribution))
+    between = common[np.ix_(own, others)]
+    rest = other[others] - along[others]
+    square, ways = np.linalg.eigh(np.eye(len(others)) - between.T @ between)
+    more = np.sum((ways.T @ rest) ** 2 * (square > SAME) / np.maximum(square, SAME))
+    return one.share * (1.0 + float(more) / float(along[own] @ along[own]))
 
 
 def _are_two(problem: Problem, one: Score, other: Score) -> bool:
