@@ -29,7 +29,7 @@ from garat_jax.diagnosis.starts import Fit
 from garat_jax.diagnosis.steps import Step, fit_only, prune
 
 RIVALS = 2
-"""How many candidates behind the first are followed for one more effect; and one that is paired."""
+"""How many candidates behind the first are followed for one more effect."""
 LOOK_AHEAD = 2
 """Effects held from which rivals are not followed any more: each path is a round of its own, and
 rounds take longer with every effect held."""
@@ -137,7 +137,7 @@ def _one_or_two(
     if not gains(best):
         return judged, first_step(problem, judged, current)
     rivals = [path for path in followed if path is not best]
-    sure = [path for path in rivals if path.is_as_sure_as(best) and gains(path)]
+    sure = [path for path in rivals if gains(path) and path.is_as_sure_as(best)]
     simple = simplest(problem, metric, best.fit, [path.fit for path in sure])
     best = next(path for path in followed if path.fit is simple)
     others = [path for path in followed if not best.is_like(path)]
@@ -283,13 +283,18 @@ def _rivals(
             is_open = is_above(problem, metric, contender.fit, floor, AT_FLOOR)
             own = contender.score.effect
             simpler = [(c, k) for c, k in fitted if refines(problem, own, k.score.effect)]
-            paired = [(c, k) for c, k in fitted[1:] if k.is_paired]
-            return [*simpler[: 1 + RIVALS], *paired] if is_open else []
+            return (
+                _with_paired([*fitted[:1], *simpler[: 1 + RIVALS]], fitted)[1:] if is_open else []
+            )
         if first.why in ANOTHER_MAY_HELP and num_held < LOOK_AHEAD:
-            likely = _one_of_each(fitted)
-            paired = [(c, k) for c, k in likely[1 + RIVALS :] if k.is_paired]
-            return [*likely[: 1 + RIVALS], *paired]
+            return _with_paired(_one_of_each(fitted)[: 1 + RIVALS], fitted)
     return []
+
+
+def _with_paired(likely: Sequence[tuple[Candidate, Contender]], fitted):
+    """Add what is paired among those that were fitted, if it is not like one that is likely."""
+    like = {named for c, _ in likely for named in (c.named, *c.indistinguishable_from)}
+    return [*likely, *((c, k) for c, k in fitted if k.is_paired and c.named not in like)]
 
 
 def _one_of_each(fitted: Sequence[tuple[Candidate, Contender]]):

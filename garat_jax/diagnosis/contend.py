@@ -40,7 +40,7 @@ class Contender:
         score: What screening said, with the fit's p-value once it was tested.
         fit: All selected effects and this one, fitted.
         timeless: As a timestep of 0 would have it, where that was measured.
-        is_paired: Whether it and another may explain far more together; see `together`.
+        is_paired: Whether it is the stronger of two that may explain far more; see `together`.
     """
 
     score: Score

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from garat_jax.diagnosis.ahead import choose
+from garat_jax.diagnosis.ahead import LOOK_AHEAD, choose
 from garat_jax.diagnosis.contend import Contender, complete, under_another_name
 from garat_jax.diagnosis.findings import Candidate, Named, apart
 from garat_jax.diagnosis.fit import fit
@@ -255,7 +255,10 @@ def _select(problem: Problem, current: Fit, floor: Floor, steps: Sequence[Step],
             break
         held = [step.effect for step in steps]
         say(f"scoring the candidates, round {number + 1}{_beside(problem, held)}")
-        judged = run_round(problem, metric, current, held, floor, say, refinable=held)
+        few = len(held) < LOOK_AHEAD
+        judged = run_round(
+            problem, metric, current, held, floor, say, refinable=held, looks_ahead=few
+        )
         follow = functools.partial(follow_up, problem, metric, say)
         judged, chosen = choose(problem, metric, current, judged, held, follow, say)
         first_round = first_round or tuple(candidate for candidate, _ in judged)

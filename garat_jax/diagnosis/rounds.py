@@ -1,11 +1,15 @@
 """One round of forward selection: screen the candidates, fit the likely ones and judge them all."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from garat_jax.diagnosis.contend import (
     CONTENDERS,
     Contender,
     fit_contenders,
+    fit_one,
     with_evidence,
     with_twins,
 )
@@ -16,7 +20,7 @@ from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.rivals import fill_out, refine
 from garat_jax.diagnosis.screen import screen
 from garat_jax.diagnosis.starts import Fit
-from garat_jax.diagnosis.together import with_paired
+from garat_jax.diagnosis.together import far_better_pair
 
 FOLLOWED = 2
 """Candidates that are fitted beside each rival that is followed for one more effect."""
@@ -32,6 +36,7 @@ def run_round(
     refinable: Sequence[int] = (),
     above: float = ABOVE_FLOOR,
     num: int = CONTENDERS,
+    looks_ahead: bool = False,
 ) -> Judged:
     """Screen the candidates, fit the likely ones and judge them all.
 
@@ -45,18 +50,23 @@ def run_round(
         refinable: Those of them in whose place a refinement may come.
         above: Multiple of the floor above which candidates are fitted.
         num: How many are; see `fit_contenders`.
+        looks_ahead: Whether the stronger of two that may explain far more together is fitted, too.
     """
     gap = is_above(problem, metric, current, floor, above)
     scores = screen(problem, current, held)
     contenders = fit_contenders(problem, current, refinable, scores, say, num) if gap else []
-    if num == CONTENDERS:
-        contenders = with_paired(problem, current, scores, contenders, say)
+    pair = far_better_pair(problem, current, scores, contenders) if looks_ahead else None
+    stronger = pair.stronger if pair else None
+    if stronger and all(c.score.effect != stronger.effect for c in contenders):
+        contenders = [*contenders, fit_one(problem, current, stronger, np.inf, say)]
     contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
     contenders = refine(problem, metric, current, scores, contenders, floor, say)
     contenders = fill_out(problem, metric, contenders, floor, say)
     contenders = with_twins(problem, current, scores, contenders, say)
     num_tests = len([score for score in scores if not score.excluded])
     contenders = with_evidence(problem, current, contenders, num_tests)
+    paired = stronger.effect if stronger else None
+    contenders = [dataclasses.replace(c, is_paired=c.score.effect == paired) for c in contenders]
     judged = judge(problem, metric, current, scores, contenders, floor)
     gains = gains_in_turn(problem, metric, current, judged, say)
     return judge(problem, metric, current, scores, contenders, floor, gains) if gains else judged

@@ -58,7 +58,8 @@ class Score:
         possible: Whether the expected values are physically possible.
         contribution: Its part of the predictions on the fitted data, [M].
         excluded: Why it cannot be judged; empty if it can.
-        changes: What each of its parameters changes there, [M, k], where it can.
+        changes: What each of `columns` changes there, likewise beyond what initial states and the
+            parameters already free do, [M, k]; empty where it cannot be judged.
     """
 
     effect: int

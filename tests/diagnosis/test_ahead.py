@@ -13,7 +13,13 @@ from garat_jax.diagnosis.judge import NO_CERTAIN_GAIN, NO_CERTAIN_LEAD
 from garat_jax.diagnosis.metric import make_metric
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
-from garat_jax.effects import CoulombFriction, GravityScale, TorqueOffset, ViscousDamping
+from garat_jax.effects import (
+    AsymmetricFriction,
+    CoulombFriction,
+    GravityScale,
+    TorqueOffset,
+    ViscousDamping,
+)
 from tests.diagnosis.test_fit import make_problem, record
 
 TIME = np.arange(800) / 200.0
@@ -22,8 +28,9 @@ EFFECTS = [
     GravityScale("world"),
     TorqueOffset("joint/hinge"),
     CoulombFriction("joint/hinge"),
+    AsymmetricFriction("joint/hinge"),
 ]
-DAMPING, GRAVITY, OFFSET, FRICTION = range(len(EFFECTS))
+DAMPING, GRAVITY, OFFSET, FRICTION, ASYMMETRIC = range(len(EFFECTS))
 PASSES = "passes every gate"
 
 
@@ -113,13 +120,13 @@ def named(effect: int) -> Named:
     return Named(EFFECTS[effect].kind, EFFECTS[effect].target)
 
 
-def followed(problem, why_first: str, paired: int) -> list[int]:
-    """Return from which of four candidates is looked ahead, of which one is paired."""
+def followed(problem, order: tuple[int, ...], why_first: str, paired: int) -> list[int]:
+    """Return from which of some candidates is looked ahead, of which one is paired."""
     current = settle(problem, problem.simulator.base, problem.segments.start)
 
     def pair(effect: int) -> tuple[Candidate, Contender]:
         law, none = EFFECTS[effect], Interval(0.0, 0.0, 0.0)
-        why = why_first if effect == DAMPING else NO_CERTAIN_LEAD
+        why = why_first if effect == order[0] else NO_CERTAIN_LEAD
         what = (law.kind, law.target, {}, 0.1, 0.0, 0.0, none, 0.5, (), why == PASSES, why)
         score = Score(effect, (effect,), (0.1,), {}, 0.9, 1e-9, True, np.zeros(0))
         return Candidate(*what), Contender(score, current, is_paired=effect == paired)
@@ -130,7 +137,7 @@ def followed(problem, why_first: str, paired: int) -> list[int]:
         seen.append(contender.score.effect)
         return []
 
-    judged = [pair(effect) for effect in range(len(EFFECTS))]
+    judged = [pair(effect) for effect in order]
     choose(problem, make_metric(problem), current, judged, [], follow, [].append)
     return seen
 
@@ -146,7 +153,18 @@ def followed(problem, why_first: str, paired: int) -> list[int]:
     ],
 )
 def test_what_is_paired_is_looked_ahead_from_as_well(problem, why_first, paired, expected):
-    assert followed(problem, why_first, paired) == expected
+    order = (DAMPING, GRAVITY, OFFSET, FRICTION)
+    assert followed(problem, order, why_first, paired) == expected
+
+
+@pytest.mark.parametrize("paired", [DAMPING, GRAVITY])
+def test_from_a_law_that_the_first_refines_is_looked_ahead_once(problem, paired):
+    order = (ASYMMETRIC, DAMPING, GRAVITY)
+    assert followed(problem, order, PASSES, paired) == list(dict.fromkeys([DAMPING, paired]))
+
+
+def test_beside_a_rival_there_may_be_nothing_else(problem):
+    assert chosen(problem, {OFFSET: 0.3}, {})[1] == [named(DAMPING)]
 
 
 def test_a_path_that_leads_the_others_makes_its_first_pass(problem):

@@ -5,10 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis import together
 from garat_jax.diagnosis.contend import Contender
+from garat_jax.diagnosis.metric import make_metric, noise_floor
+from garat_jax.diagnosis.rounds import run_round
 from garat_jax.diagnosis.screen import Score
-from garat_jax.diagnosis.together import best_pair, with_paired
+from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.together import Pair, best_pair, far_better_pair
 from garat_jax.effects import (
     AsymmetricFriction,
     EncoderScale,
@@ -16,6 +18,7 @@ from garat_jax.effects import (
     JointStiffness,
     ViscousDamping,
 )
+from tests.diagnosis.test_steps import DRAG, GAIN, damped_and_pulled
 
 AT = "joint/hinge"
 EFFECTS = (
@@ -47,7 +50,7 @@ def third(effect: int) -> Score:
     return screened(effect, ONE + OTHER + 0.6 * NOISE)
 
 
-def effects(pair: together.Pair | None):
+def effects(pair: Pair | None):
     return pair and (pair.stronger.effect, pair.weaker.effect)
 
 
@@ -79,45 +82,39 @@ def test_their_share_is_that_of_least_squares_on_what_both_change():
         [screened(DAMPING, ONE), screened(ASYMMETRIC, OTHER)],
         [screened(ENCODER, ONE), screened(GRAVITY, OTHER, possible=False)],
         [screened(ENCODER, ONE), screened(GRAVITY, NOISE)],
+        [screened(ENCODER, ONE + 2.0 * NOISE), screened(GRAVITY, ONE + 0.5 * OTHER + 4.0 * NOISE)],
         [screened(ENCODER, ONE)],
         [],
     ],
-    ids=["alike", "laws of the same", "impossible", "of no use", "one", "none"],
+    ids=["alike", "laws of the same", "impossible", "of no use", "turned round", "one", "none"],
 )
 def test_there_is_no_pair(scores):
     assert best_pair(PROBLEM, scores) is None
 
 
-def fitted(effect: int, left: float) -> Contender:
-    fit = SimpleNamespace(cost=np.asarray([left, 0.0]))
-    return Contender(screened(effect, ONE), fit)
-
-
-@pytest.mark.parametrize(
-    ("best_left", "known", "is_marked", "is_fitted"),
-    [(0.3, (), True, True), (0.3, (ENCODER,), True, False), (0.009, (ENCODER,), False, False)],
-    ids=["not fitted yet", "fitted", "the best one leaves hardly more"],
-)
-def test_the_stronger_is_marked_where_both_leave_far_less_than_the_best_one(
-    monkeypatch, best_left, known, is_marked, is_fitted
-):
-    said = []
-
-    def fit_one(problem, current, score, rival, say):
-        said.append(score.effect)
-        return fitted(score.effect, 0.6)
-
-    monkeypatch.setattr(together, "fit_one", fit_one)
-    scores = [third(SPRING), screened(ENCODER, ONE + 0.1 * OTHER), screened(GRAVITY, OTHER)]
-    contenders = [fitted(SPRING, best_left), *(fitted(effect, 0.6) for effect in known)]
+@pytest.mark.parametrize(("left", "is_better"), [([], False), ([0.3], True), ([0.3, 0.009], False)])
+def test_two_are_far_better_than_what_the_best_one_left(left, is_better):
+    scores = [third(SPRING), screened(ENCODER, ONE), screened(GRAVITY, OTHER)]
+    contenders = [
+        Contender(scores[0], SimpleNamespace(cost=np.asarray([cost, 0.0]))) for cost in left
+    ]
     current = SimpleNamespace(cost=np.asarray([1.0, 0.0]))
-    found = with_paired(PROBLEM, current, scores, contenders, print)
-    marked = [c.score.effect for c in found if c.is_paired]
-    assert marked == [ENCODER] * is_marked
-    assert said == [ENCODER] * is_fitted
-    assert len(found) == len(contenders) + is_fitted
+    assert bool(far_better_pair(PROBLEM, current, scores, contenders)) == is_better
 
 
-def test_nothing_is_marked_where_nothing_was_fitted():
-    scores = [screened(ENCODER, ONE), screened(GRAVITY, OTHER)]
-    assert with_paired(PROBLEM, SimpleNamespace(), scores, [], print) == []
+@pytest.mark.parametrize(("looks_ahead", "marked"), [(True, ["motor_gain"]), (False, [])])
+def test_a_round_that_looks_ahead_fits_the_stronger_and_marks_it(monkeypatch, looks_ahead, marked):
+    problem, said = damped_and_pulled(), []
+
+    def gain_and_drag(problem, current, scores, contenders):
+        scores = {score.effect: score for score in scores}
+        return Pair(scores[GAIN], scores[DRAG], 1.0)
+
+    monkeypatch.setattr("garat_jax.diagnosis.rounds.far_better_pair", gain_and_drag)
+    metric = make_metric(problem)
+    before = settle(problem, problem.simulator.base, problem.segments.start)
+    floor = noise_floor(problem, metric, before)
+    what = (problem, metric, before, [], floor, said.append)
+    judged = run_round(*what, num=1, looks_ahead=looks_ahead)
+    assert [candidate.effect for candidate, c in judged if c and c.is_paired] == marked
+    assert ("fitting motor_gain at actuator/motor" in said) == looks_ahead
