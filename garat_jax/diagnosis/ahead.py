@@ -280,21 +280,24 @@ def _rivals(
     for first, contender in fitted[:1]:
         if first.passes:
             floor = noise_floor(problem, metric, contender.fit)
-            is_open = is_above(problem, metric, contender.fit, floor, AT_FLOOR)
+            if not is_above(problem, metric, contender.fit, floor, AT_FLOOR):
+                return []
             own = contender.score.effect
             simpler = [(c, k) for c, k in fitted if refines(problem, own, k.score.effect)]
-            return (
-                _with_paired([*fitted[:1], *simpler[: 1 + RIVALS]], fitted)[1:] if is_open else []
-            )
+            likely = simpler[: 1 + RIVALS]
+            return [*likely, *_paired(fitted, [(first, contender), *likely])]
         if first.why in ANOTHER_MAY_HELP and num_held < LOOK_AHEAD:
-            return _with_paired(_one_of_each(fitted)[: 1 + RIVALS], fitted)
+            likely = _one_of_each(fitted)[: 1 + RIVALS]
+            return [*likely, *_paired(fitted, likely)]
     return []
 
 
-def _with_paired(likely: Sequence[tuple[Candidate, Contender]], fitted):
-    """Add what is paired among those that were fitted, if it is not like one that is likely."""
+def _paired(
+    fitted: Sequence[tuple[Candidate, Contender]], likely: Sequence[tuple[Candidate, Contender]]
+) -> list[tuple[Candidate, Contender]]:
+    """Return what is paired among those that were fitted, if it is not like one that is likely."""
     like = {named for c, _ in likely for named in (c.named, *c.indistinguishable_from)}
-    return [*likely, *((c, k) for c, k in fitted if k.is_paired and c.named not in like)]
+    return [(c, k) for c, k in fitted if k.is_paired and c.named not in like]
 
 
 def _one_of_each(fitted: Sequence[tuple[Candidate, Contender]]):
