@@ -256,6 +256,8 @@ def warn_of_policy(env: RecordedEnv, policy: Policy, steps: Steps) -> tuple[str,
 def _choose_reach(lesson: Lesson, trainer: Trainer) -> float:
     """Return how far a transformer may have to change an action, in half-ranges, at most 1.
 
+    It is 1 where no command did anything in the recorded states: nothing says how far.
+
     GARAT's transformer changes it at most so much, and starts with noise of a fixed share of that;
     GAT's source acts with noise of that size, so that its inverse model knows such commands. Were
     it the whole range, a small effect would drown in it.
@@ -263,6 +265,8 @@ def _choose_reach(lesson: Lesson, trainer: Trainer) -> float:
     env, world, seen = lesson.env, lesson.world, lesson.seen
     options = compiler_options(world)
     change = trainer.call(lambda w: needed_change(env, w, seen), world, options=options)
+    if not change.any():
+        return 1.0
     return float(min(1.0, np.max(REACH * change / ((env.action_high - env.action_low) / 2))))
 
 

@@ -199,8 +199,10 @@ def exploring(env: Env, policy: Policy, scale: float) -> Policy:
 def needed_change(env: RecordedEnv, params: Dynamics, steps: Steps) -> jax.Array:
     """Return how far commands are from those that would go where the recordings went, [nu].
 
-    Root mean square over the steps, by linear least squares in each; residuals count relative to
-    the sensors' noise. What noise alone would need is part of it.
+    Root mean square over the steps, by linear least squares in each, within the range of commands;
+    residuals count relative to the sensors' noise. What noise alone would need is part of it. A
+    step in which a command does nothing, as where its motor is saturated, or in which physics is
+    not finite, says nothing about it and does not count; without any other, 0 is returned.
     """
     quiet, transitions = env.without_noise(), as_transitions(env, steps)
     smallest = 1e-3 * steps.state.std(axis=0) + 1e-9
@@ -208,17 +210,19 @@ def needed_change(env: RecordedEnv, params: Dynamics, steps: Steps) -> jax.Array
     middle, reach = (env.action_low + env.action_high) / 2, (env.action_high - env.action_low) / 2
     key = jax.random.key(0)  # without noise, a step draws nothing
 
-    def one(obs: jax.Array, action: jax.Array, next_obs: jax.Array) -> jax.Array:
+    def one(obs: jax.Array, action: jax.Array, next_obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         state = quiet.at(params, obs)
         inward = jnp.where(action > middle, -0.1, 0.1) * reach  # never beyond the bounds
         tried = action + jnp.concatenate([jnp.zeros((1, len(inward))), jnp.diag(inward)])
         ends = jax.vmap(lambda a: quiet.step(params, state, a, key).state.obs)(tried)
         slopes = (ends[1:] - ends[0]) / inward[:, None] * weight
         normal = slopes @ slopes.T + 1e-6 * jnp.trace(slopes @ slopes.T) * jnp.eye(len(inward))
-        return jnp.linalg.solve(normal, slopes @ ((next_obs - ends[0]) * weight))
+        change = jnp.linalg.solve(normal, slopes @ ((next_obs - ends[0]) * weight))
+        counts = jnp.any(slopes != 0, axis=1) & jnp.isfinite(change)
+        return jnp.where(counts, jnp.clip(change, -2 * reach, 2 * reach), 0.0), counts
 
-    changes = jax.vmap(one)(transitions.obs, transitions.action, transitions.next_obs)
-    return jnp.sqrt(jnp.mean(jnp.square(changes), axis=0))
+    changes, counts = jax.vmap(one)(transitions.obs, transitions.action, transitions.next_obs)
+    return jnp.sqrt(jnp.sum(jnp.square(changes), axis=0) / jnp.maximum(counts.sum(axis=0), 1))
 
 
 def path_error(

@@ -24,7 +24,7 @@ from garat_jax.ground.steps import choose_bounds, control_steps, draw
 from garat_jax.methods.garat import GARATConfig
 from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.make import make_method
-from garat_jax.methods.recorded import as_transitions, clone, cloned, needed_change
+from garat_jax.methods.recorded import as_transitions, clone, cloned
 from garat_jax.runs import RunDirectory
 from tests import models
 from tests.probe_envs import Hang
@@ -51,15 +51,6 @@ def test_the_source_begins_where_the_sensors_reported_it(read):
     nearest = np.abs(obs[:, None] - steps.state).min(axis=1)
     assert (nearest < 5 * noise).all()
     assert env.episode_length == 31
-
-
-def test_the_needed_change_of_a_command_is_the_hidden_torque(read, recorded):
-    model, recordings = read
-    bounds = choose_bounds(model, recordings)
-    steps = control_steps(recordings, bounds.interval)
-    env, world = make_source(model, steps.state, np.asarray([1e-3, 1e-2]), bounds, 0.5)
-    change = jax.jit(lambda w: needed_change(env, w, steps))(world)
-    assert change == pytest.approx(abs(recorded[2]), rel=0.25)  # noise is in it
 
 
 def test_a_transform_acts_before_the_model_as_its_equal_effect(read, recorded):
