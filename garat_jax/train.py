@@ -14,7 +14,7 @@ from rich.console import Console
 from garat_jax import checkpoint, split
 from garat_jax.devices import peak_mebibytes
 from garat_jax.env import EnvState
-from garat_jax.errors import DivergedError, UserError
+from garat_jax.errors import DivergedError
 from garat_jax.interrupt import deferred_interrupt
 from garat_jax.rollout import Fault
 from garat_jax.runs import SECONDS, RunDirectory
@@ -107,25 +107,27 @@ class Trainer:
         Raises:
             DivergedError: A learner stopped being finite, or its worlds left the finite numbers too
                 often.
-            UserError: The stage is over, and its checkpoint is gone or damaged.
+            UserError: The newest checkpoint is damaged.
         """
         folder = self.run.path(f"checkpoints/{stage}")
-        first, is_restored = 0, False
+        first = 0
         if self.run.resumed and (latest := checkpoint.latest_step(folder)) is not None:
-            state, first, is_restored = checkpoint.restore(folder, state), latest, True
+            state, first = checkpoint.restore(folder, state), latest
             self.console.print(f"{stage}: restored after iteration {first}")
-        if (self.run.root / _done(stage)).exists():
-            if not is_restored:
-                raise UserError(
-                    f"{stage} is over, but its checkpoint in {folder} is gone; start anew with "
-                    "--force"
-                )
+        if self._was_over(stage, first):
             return state
         if self.run.resumed:
             self.run.rewind(first, stage)
         compiled, run = self._compile(_with_finite(step), (state, params), options)
         self.console.print(f"{stage}: memory {_memory(compiled)}")
         return self._loop(stage, run, state, params, first, num_iterations)
+
+    def _was_over(self, stage: str, iteration: int) -> bool:
+        """Say whether a stage ended after so many iterations, rather than after more."""
+        done = _done(stage)
+        if not (self.run.root / done).exists():
+            return False
+        return iteration >= self.run.read_json(done)["iterations"]
 
     def call(self, function: Callable, *arguments: Any, options: dict[str, Any] | None = None):
         """Compile a function, call it once, and return its result when it is there."""
@@ -166,15 +168,15 @@ class Trainer:
                     self._check(stage, iteration, last, new, metrics, np.asarray(finite))
                     self.run.log(iteration, stage=stage, **metrics)
                     progress = (iteration, new)
+                    is_finished = "finished" in metrics and bool(metrics["finished"].all())
+                    is_over = is_finished or iteration >= num_iterations
                     now = time.monotonic()
                     if now - reported > REPORT_SECONDS:
                         reported = now
                         self._report(stage, iteration, num_iterations, metrics)
-                    if now - saved > CHECKPOINT_SECONDS:
+                    if now - saved > CHECKPOINT_SECONDS and not is_over:
                         self._save(folder, *progress)
                         saved = self._spent(saved)
-                    is_finished = "finished" in metrics and bool(metrics["finished"].all())
-                    is_over = is_finished or iteration >= num_iterations
         except KeyboardInterrupt:
             self._keep(stage, *progress, is_over)
             raise
@@ -188,9 +190,11 @@ class Trainer:
 
     def _keep(self, stage: str, iteration: int, state, is_over: bool) -> None:
         """Save a stage as it is left: over, or to be resumed."""
-        self._save(self.run.path(f"checkpoints/{stage}"), iteration, state)
         if is_over:
+            # First: a process that is killed in between does the last iterations again. With the
+            # checkpoint alone it would not know that every seed has solved its task.
             self.run.write_json(_done(stage), {"iterations": iteration})
+        self._save(self.run.path(f"checkpoints/{stage}"), iteration, state)
 
     def _save(self, folder, iteration: int, state) -> None:
         latest = checkpoint.latest_step(folder)
@@ -279,7 +283,7 @@ def _too_many(share: np.ndarray) -> str:
 
 
 def _done(stage: str) -> str:
-    """Return the file that says that a stage is over."""
+    """Return the file that says after how many iterations a stage is over."""
     return f"stages/{stage}.json"
 
 

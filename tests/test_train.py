@@ -19,7 +19,7 @@ from garat_jax.effects import Backlash
 from garat_jax.env import make_world
 from garat_jax.envs.half_cheetah import HalfCheetah
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
-from garat_jax.errors import DivergedError, UserError
+from garat_jax.errors import DivergedError
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer, UntilSolved
 
@@ -135,15 +135,6 @@ def test_a_stage_without_iterations_is_over_at_its_start(tmp_path):
     for resume in (False, True):
         run = directory(tmp_path / "run", resume=resume)
         assert_same_state(trainer(run).train("walk", step, start, 0.1, 0), start)
-
-
-def test_a_stage_that_is_over_and_has_lost_its_checkpoint_is_not_taken_for_its_start(tmp_path):
-    step, start = learner()
-    run = directory(tmp_path / "run")
-    trainer(run).train("walk", step, start, 0.1, 3)
-    shutil.rmtree(run.path("checkpoints/walk"))
-    with pytest.raises(UserError, match=r"walk is over, but its checkpoint in .* is gone"):
-        trainer(directory(tmp_path / "run", resume=True)).train("walk", step, start, 0.1, 3)
 
 
 def test_stages_keep_apart_what_they_leave(tmp_path):
