@@ -14,7 +14,7 @@ from rich.console import Console
 from garat_jax import checkpoint, split
 from garat_jax.devices import peak_mebibytes
 from garat_jax.env import EnvState
-from garat_jax.errors import DivergedError
+from garat_jax.errors import DivergedError, UserError
 from garat_jax.interrupt import deferred_interrupt
 from garat_jax.rollout import Fault
 from garat_jax.runs import SECONDS, RunDirectory
@@ -107,11 +107,16 @@ class Trainer:
         Raises:
             DivergedError: A learner stopped being finite, or its worlds left the finite numbers too
                 often.
-            UserError: The newest checkpoint is damaged.
+            UserError: The newest checkpoint is damaged, or the run was not opened to be resumed.
         """
         folder = self.run.path(f"checkpoints/{stage}")
         first = 0
-        if self.run.resumed and (latest := checkpoint.latest_step(folder)) is not None:
+        if (latest := checkpoint.latest_step(folder)) is not None:
+            if not self.run.resumed:
+                raise UserError(
+                    f"{self.run.root} holds {stage!r} already: open it by RunDirectory.create(..., "
+                    "resume=True) to go on with it, or give a new run directory"
+                )
             state, first = checkpoint.restore(folder, state), latest
             self.console.print(f"{stage}: restored after iteration {first}")
         if self._was_over(stage, first):

@@ -19,7 +19,7 @@ from garat_jax.effects import Backlash
 from garat_jax.env import make_world
 from garat_jax.envs.half_cheetah import HalfCheetah
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
-from garat_jax.errors import DivergedError
+from garat_jax.errors import DivergedError, UserError
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer, UntilSolved
 
@@ -128,6 +128,19 @@ def test_a_stage_that_is_over_is_not_run_again(tmp_path):
     again = directory(tmp_path / "run", resume=True)
     assert_same_state(trainer(again).train("walk", never, start, 0.1, 3), first)
     assert len(lines(again)) == 3
+
+
+def test_a_run_directory_is_used_once(tmp_path):
+    step, start = learner()
+    whole, cut = directory(tmp_path / "whole"), directory(tmp_path / "cut", Interrupting)
+    trainer(whole).train("walk", step, start, 0.1, 3)
+    with pytest.raises(KeyboardInterrupt):
+        trainer(cut).train("walk", step, start, 0.1, 6)
+    for run in (whole, cut):
+        before = lines(run)
+        with pytest.raises(UserError, match=r"holds 'walk' already: .* resume=True"):
+            trainer(run).train("walk", step, start, 0.1, 3)
+        assert lines(run) == before
 
 
 def test_a_stage_without_iterations_is_over_at_its_start(tmp_path):
