@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from garat_jax.agents import actor_critic, ppo
+from garat_jax.agents import actor_critic, ppo, trpo
 from garat_jax.agents.actor_critic import Batch
 from garat_jax.agents.ppo import PPOConfig, ppo_loss
+from garat_jax.agents.trpo import TRPOConfig
 from tests.probe_envs import Walk, WalkParams
 
 CONFIG = PPOConfig(clip=0.2, value_weight=0.5, entropy_weight=0.0)
@@ -91,3 +92,32 @@ def test_no_episode_is_said_to_be_longer_than_it_may_be():
     assert metrics["episode_length"] == env.episode_length
     _, metrics, _ = agent.step(state, params)  # each ends one
     assert metrics["episode_length"] == 5
+
+
+@pytest.mark.parametrize(
+    ("agent", "config"), [(ppo, PPOConfig), (trpo, TRPOConfig)], ids=["ppo", "trpo"]
+)
+def test_after_a_batch_observations_are_normalised_by_all_that_was_seen(agent, config):
+    env, params = Walk(), WalkParams(0.1)
+    step, state = started(agent.make(env, config(num_envs=4, num_steps=10)), params)
+    seen = []
+    for _ in range(2):
+        state, _, transitions = step(state, params)
+        seen.append(np.asarray(env.features(transitions.obs)).reshape(-1, env.obs_size))
+        both = np.concatenate(seen)
+        np.testing.assert_allclose(state.policy.normaliser.mean, both.mean(axis=0), rtol=1e-5)
+        np.testing.assert_allclose(state.policy.normaliser.std, both.std(axis=0), rtol=1e-5)
+
+
+def test_a_batch_is_learned_from_as_it_was_normalised_when_it_was_collected():
+    params = WalkParams(0.1)
+    config = PPOConfig(num_envs=4, num_steps=10, learning_rate=0.0)
+    step, state = started(ppo.make(Walk(), config), params)
+    for _ in range(2):
+        state, metrics, _ = step(state, params)
+        assert metrics["kl"] == pytest.approx(0, abs=1e-6)
+
+
+def started(agent, params):
+    """Return an agent's compiled step, and its start."""
+    return jax.jit(agent.step), agent.init(jax.random.key(0), params)
