@@ -78,7 +78,7 @@ def join_processes(
         and JAX_PROCESS_ID, or from Slurm or MPI.
 
     Raises:
-        UserError: The processes do not come together, or as `use`.
+        UserError: The processes do not come together, this is none of them, or as `use`.
     """
     _prefer(device)
     # It would take SIGTERM, for those who ask it; here Python's handler ends the run.
@@ -86,6 +86,10 @@ def join_processes(
     address = coordinator or os.environ.get("JAX_COORDINATOR_ADDRESS")
     number = _or_variable(process, "JAX_PROCESS_ID")
     count = _or_variable(num_processes, "JAX_NUM_PROCESSES")
+    if count is not None and count < 1:
+        raise UserError(f"--num-processes {count}: expected 1 or more")
+    if number is not None and count is not None and not 0 <= number < count:
+        raise UserError(f"--process-id {number}: expected 0 to {count - 1}")
     if address:
         _check_address(address, wait=bool(number))
     try:

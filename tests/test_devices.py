@@ -33,3 +33,21 @@ def test_a_variable_that_is_no_number_is_refused(variable, monkeypatch):
     monkeypatch.setenv(variable, "two")
     with pytest.raises(UserError, match=f"^the variable {variable} is 'two'; expected a whole"):
         devices.join_processes("127.0.0.1:1234", None, None)
+
+
+@pytest.mark.parametrize(
+    ("count", "number", "message"),
+    [
+        (2, 5, "--process-id 5: expected 0 to 1"),
+        (2, 2, "--process-id 2: expected 0 to 1"),
+        (2, -1, "--process-id -1: expected 0 to 1"),
+        (0, 0, "--num-processes 0: expected 1 or more"),
+    ],
+)
+def test_a_process_that_is_none_of_them_is_refused_at_once(count, number, message, monkeypatch):
+    monkeypatch.setattr(devices, "_check_address", None)  # nobody is waited for
+    with pytest.raises(UserError, match=f"^{message}$"):
+        devices.join_processes("localhost:1234", count, number)
+    monkeypatch.setenv("JAX_NUM_PROCESSES", str(count))
+    with pytest.raises(UserError, match=f"^{message}$"):
+        devices.join_processes("localhost:1234", None, number)
