@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Iterable, Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Entry = TypeVar("Entry")
 
@@ -17,6 +17,21 @@ class EarlierRunStays(KeyboardInterrupt):
 
 class DivergedError(RuntimeError):
     """Say in one line at which step and seed a computation stopped being finite."""
+
+
+def check_at_least(config: Any, **least: float) -> None:
+    """Refuse settings that have a number below the least that it may be.
+
+    Args:
+        config: The settings.
+        **least: The least of some of them.
+
+    Raises:
+        UserError: A number is smaller.
+    """
+    for name, number in least.items():
+        if getattr(config, name) < number:
+            raise UserError(f"{name} is {getattr(config, name)}; expected {number} or more")
 
 
 def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:

@@ -21,7 +21,7 @@ from garat_jax.compiler_options import compiler_options
 from garat_jax.dynamics import Override
 from garat_jax.effects import Effect
 from garat_jax.env import Env, Task, World, make_world
-from garat_jax.errors import UserError
+from garat_jax.errors import check_at_least
 from garat_jax.methods.garat import GARATConfig
 from garat_jax.methods.gat import GATConfig
 from garat_jax.methods.grounded import GroundedEnv, Grounding, action_noise, check_bounded
@@ -98,12 +98,9 @@ class TransferConfig:
 
     def __post_init__(self) -> None:
         """Refuse what would fail after hours."""
-        least = {"seeds": 1, "num_episodes": 1, "num_solving_episodes": 1}
-        least |= dict.fromkeys(("num_updates", "num_retraining", "first_seed"), 0)
-        least |= {"num_curve_transitions": 1, "num_target_transitions": self.agent.num_envs}
-        for name, number in least.items():
-            if getattr(self, name) < number:
-                raise UserError(f"{name} is {getattr(self, name)}; expected {number} or more")
+        check_at_least(self, num_updates=0, num_retraining=0, first_seed=0)
+        check_at_least(self, seeds=1, num_episodes=1, num_solving_episodes=1)
+        check_at_least(self, num_curve_transitions=1, num_target_transitions=self.agent.num_envs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +114,9 @@ class GroundConfig:
         num_transitions: Most recorded control steps that it learns from, drawn at random.
         num_held_out: Most held-out control steps that the transition error is measured on.
         episode: Seconds that a rollout in the source goes on from a recorded state.
+
+    Raises:
+        UserError: There is nothing to learn, to learn from or to measure on.
     """
 
     method: str
@@ -125,6 +125,10 @@ class GroundConfig:
     num_transitions: int = 5000  # Desai et al. 2020
     num_held_out: int = 2000
     episode: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse what would fail when it has been learned."""
+        check_at_least(self, num_updates=1, num_transitions=1, num_held_out=1, episode=0)
 
     def reaching(self, reach: float) -> GARATConfig | GATConfig:
         """Return the learner's settings, GARAT's with a reach in half-ranges of the action."""
@@ -192,8 +196,7 @@ class Experiment:
             num_envs = self.config.agent.num_envs
             return state._replace(env=rollout.reset(env, params, reset_key, num_envs), key=key)
 
-        keys = _fold(self.keys, stage)
-        state = self.map(move, start, keys, params, axes=(0, 0, axes))
+        state = self.map(move, start, _fold(self.keys, stage), params, axes=(0, 0, axes))
         return self.train(
             stage,
             lambda state, params: agent.step(state, params)[:2],
@@ -379,7 +382,6 @@ def _errors(
 ) -> dict[str, np.ndarray]:
     """Return held-out transition errors [seeds] of source, grounded source and baselines."""
     source = experiment.worlds.source
-
     recorded = rollout.thinned(recorded, experiment.config.num_curve_transitions)
 
     def errors(transformer: Params, recorded: Recorded, held_out: Recorded):

@@ -9,13 +9,16 @@ import pytest
 
 from garat_jax import train
 from garat_jax.agents import trpo
+from garat_jax.agents.ppo import PPOConfig
 from garat_jax.agents.trpo import TRPOConfig
 from garat_jax.dynamics import Override
 from garat_jax.env import EnvState, make_world
 from garat_jax.envs.inverted_pendulum import InvertedPendulum
 from garat_jax.envs.pairs import PAIRS
 from garat_jax.errors import DivergedError, UserError
-from garat_jax.presets import METHODS
+from garat_jax.methods.garat import GARATConfig
+from garat_jax.methods.gat import GATConfig
+from garat_jax.presets import GROUNDING, METHODS
 from garat_jax.rollout import Recorded, thinned
 from garat_jax.runs import RunDirectory
 from garat_jax.train import Trainer
@@ -48,6 +51,26 @@ def test_settings_that_would_fail_at_the_end_are_refused_at_once(changed, said):
     config = METHODS["garat"](PAIRS["inverted_pendulum_heavy"])
     with pytest.raises(UserError, match=said):
         dataclasses.replace(config, agent=TRPOConfig(num_envs=50), **changed)
+
+
+@pytest.mark.parametrize(
+    ("config", "changed", "said"),
+    [
+        (GARATConfig(), {"output": "chnage"}, "unknown output 'chnage'; did you mean change"),
+        (GATConfig(), {"num_epochs": 0}, "num_epochs is 0; expected 1 or more"),
+        (GATConfig(), {"minibatch": 0}, "minibatch is 0; expected 1 or more"),
+        (GATConfig(), {"num_envs": 0}, "num_envs is 0; expected 1 or more"),
+        (PPOConfig(), {"num_epochs": 0}, "num_epochs is 0; expected 1 or more"),
+        (PPOConfig(), {"num_steps": 0}, "num_steps is 0; expected 1 or more"),
+        (GROUNDING["gat"], {"num_updates": 0}, "num_updates is 0; expected 1 or more"),
+        (GROUNDING["gat"], {"num_transitions": 0}, "num_transitions is 0; expected 1 or more"),
+        (GROUNDING["gat"], {"num_held_out": 0}, "num_held_out is 0; expected 1 or more"),
+        (GROUNDING["gat"], {"episode": -1}, "episode is -1; expected 0 or more"),
+    ],
+)
+def test_settings_of_grounding_that_would_fail_in_it_are_refused_at_once(config, changed, said):
+    with pytest.raises(UserError, match=said):
+        dataclasses.replace(config, **changed)
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import optax
 from garat_jax.agents import actor_critic
 from garat_jax.agents.actor_critic import ActorCriticState, Batch, static
 from garat_jax.env import Env
+from garat_jax.errors import check_at_least
 from garat_jax.networks import GaussianPolicy, ValueNet, forward
 from garat_jax.types import Agent, Number, Params
 
@@ -17,7 +18,11 @@ from garat_jax.types import Agent, Number, Params
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """Hyper-parameters; the defaults are Desai et al. 2020, appendix, action transformer."""
+    """Hyper-parameters; the defaults are Desai et al. 2020, appendix, action transformer.
+
+    Raises:
+        UserError: There is nothing to learn, or to learn from.
+    """
 
     num_envs: int = static(50)
     num_steps: int = static(100)  # 50 x 100 = 5000 steps a batch, as the paper
@@ -32,6 +37,10 @@ class PPOConfig:
     value_weight: Number = 0.5  # stable-baselines3 PPO
     entropy_weight: Number = 0.0
     max_grad_norm: Number = 0.5  # stable-baselines PPO2
+
+    def __post_init__(self) -> None:
+        """Refuse what would fail in the first step; the leaves may be anything."""
+        check_at_least(self, num_envs=1, num_steps=1, num_epochs=1)
 
 
 def make(env: Env, config: PPOConfig) -> Agent:

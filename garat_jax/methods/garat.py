@@ -5,7 +5,7 @@ discriminator tells grounded from target transitions, and the transformer learns
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from garat_jax.agents import ppo
 from garat_jax.agents.actor_critic import ActorCriticState, PolicyParams
 from garat_jax.agents.ppo import PPOConfig
 from garat_jax.env import Env
+from garat_jax.errors import unknown_name
 from garat_jax.methods.grounded import (
     GroundedEnv,
     Output,
@@ -33,7 +34,8 @@ class GARATConfig:
     """Hyper-parameters; docs/grounding.md has the measurements behind the defaults.
 
     Raises:
-        UserError: The transformer's batch cannot make its minibatches, or the discriminator's.
+        UserError: The transformer's batch cannot make its minibatches, or the discriminator's, or
+            its output is unknown.
     """
 
     transformer: PPOConfig = dataclasses.field(
@@ -57,6 +59,8 @@ class GARATConfig:
 
     def __post_init__(self) -> None:
         """Refuse what would fail when grounding begins, after hours of training policies."""
+        if self.output not in get_args(Output):
+            raise unknown_name("output", self.output, get_args(Output))
         for num in (self.transformer.num_minibatches, self.num_minibatches):
             minibatch_size(self.transformer.num_envs * self.transformer.num_steps, num)
 

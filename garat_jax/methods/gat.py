@@ -14,6 +14,7 @@ import optax
 
 from garat_jax import rollout
 from garat_jax.env import Env
+from garat_jax.errors import check_at_least
 from garat_jax.methods.grounded import GroundedEnv
 from garat_jax.networks import MLP, forward
 from garat_jax.shuffle import picked
@@ -22,7 +23,11 @@ from garat_jax.types import Metrics, Params, Policy, Transition
 
 @dataclasses.dataclass(frozen=True)
 class GATConfig:
-    """Hyper-parameters."""
+    """Hyper-parameters.
+
+    Raises:
+        UserError: There is nothing to learn, or to learn from.
+    """
 
     hidden: tuple[int, ...] = (64, 64)
     learning_rate: float = 1e-3
@@ -30,6 +35,10 @@ class GATConfig:
     num_epochs: int = 10  # over both data sets, an update
     num_envs: int = 50
     num_steps: int = 200  # 50 x 200 = 10000 transitions of the source, which are cheap
+
+    def __post_init__(self) -> None:
+        """Refuse what would fail when grounding begins, after hours of training policies."""
+        check_at_least(self, minibatch=1, num_epochs=1, num_envs=1, num_steps=1)
 
 
 class Scale(NamedTuple):
