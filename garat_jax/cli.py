@@ -135,7 +135,7 @@ class Transfer:
         )
         out = self.out or Path("runs") / f"{self.pair}-{self.method}"
         if process:  # each writes what it has, and process 0 where it was told to
-            out = out.with_name(f"{out.name}-process-{process}")
+            out = Path(f"{os.path.abspath(out)}-process-{process}")  # `.` has no name
         with make_run(self, out, seeds=range(self.seeds), resume=self.resume) as run:
             say(describe(run_transfer(config, run)))
         say(f"report: {run.root / 'report.html'}")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from garat_jax import cli
+from garat_jax import cli, devices, transfer
 from garat_jax.commandline import how_to_go_on, parse
 from garat_jax.commands.checks import make_run, writing
 from garat_jax.earlier_run import earlier_run_kept
@@ -288,6 +288,20 @@ def test_nearest_is_closest_first_and_ignores_case():
 
 def test_unknown_name_without_a_near_one_lists_all():
     assert "known: a, b" in str(unknown_name("effect", "friction", ["b", "a"]))
+
+
+def test_another_process_writes_beside_where_the_first_one_does(tmp_path, monkeypatch, capsys):
+    def stop(config, run):
+        raise UserError(f"it writes into {run.root}")
+
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(devices, "join_processes", lambda *arguments: 1)
+    monkeypatch.setattr(transfer, "run_transfer", stop)
+    for out in (".", str(here), "../here"):
+        assert cli.main(["transfer", "hopper_heavy", "--distributed", "--out", out]) == 2
+        assert f"it writes into {here}-process-1\n" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("joining", [[], ["--distributed", "--num-processes", "1"]])
