@@ -19,7 +19,7 @@ from tyro.conf import Positional
 
 from garat_jax import __version__, compilation_cache
 from garat_jax.commandline import PROGRAM, arg, how_to_go_on, parse
-from garat_jax.commands.checks import make_run
+from garat_jax.commands.checks import LARGEST_SEED, make_run
 from garat_jax.commands.diagnosis import Compare, Diagnose, Ground, Improve, Plan
 from garat_jax.commands.machine import Device, Doctor
 from garat_jax.commands.models import Add, Convert, Effects, Export
@@ -64,9 +64,10 @@ class Demo:
         """Run the tour."""
         if self.measurements is not None and not self.measurements.is_dir():
             raise UserError(f"--measurements: there is no folder {self.measurements}")
-        from garat_jax.demo import run_demo
+        from garat_jax.demo import SEEDS, run_demo
 
-        with make_run(self, self.out, seeds=[self.seed], resume=self.resume) as run:
+        seeds = range(self.seed, self.seed + SEEDS)
+        with make_run(self, self.out, seeds=seeds, resume=self.resume) as run:
             run_demo(run, seed=self.seed, measurements=self.measurements)
         say(f"report: {run.root / 'report.html'}")
 
@@ -105,8 +106,8 @@ class Transfer:
 
     def run(self) -> None:
         """Run the transfer experiment."""
-        if self.seeds < 1:
-            raise UserError(f"--seeds {self.seeds}: expected 1 or more")
+        if not 1 <= self.seeds <= LARGEST_SEED + 1:
+            raise UserError(f"--seeds {self.seeds}: expected 1 to {LARGEST_SEED + 1}")
         alone = {
             "--coordinator": self.coordinator,
             "--num-processes": self.num_processes,

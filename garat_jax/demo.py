@@ -21,6 +21,7 @@ from garat_jax.terminal import say
 from garat_jax.transfer import run_transfer
 
 PAIR = "inverted_pendulum_heavy"
+SEEDS = 5
 RETRAINING = 10
 """Iterations, a sixth of the preset's; policies solve the grounded source in the first five."""
 REAL = 2
@@ -42,8 +43,9 @@ def run_demo(run: RunDirectory, seed: int, measurements: Path | None) -> None:
     console = Console(stderr=True)
     real = free_pendulum(measurements, run.path("real_measurements")) if measurements else None
     console.rule("1. Transfer: ground the source in the target's data")
-    config = dataclasses.replace(garat(PAIRS[PAIR]), first_seed=seed, num_retraining=RETRAINING)
-    seeds = range(seed, seed + config.seeds)
+    config = garat(PAIRS[PAIR], seeds=SEEDS)
+    config = dataclasses.replace(config, first_seed=seed, num_retraining=RETRAINING)
+    seeds = range(seed, seed + SEEDS)
     part = _part(run, "transfer", {"pair": PAIR}, seeds, resume=run.resumed)
     transfer = run_transfer(config, part)
     say(summary.describe(transfer))

@@ -33,7 +33,7 @@ def make_run(
     Args:
         command: A command with a field `force`.
         out: The folder.
-        seeds: The seeds of the run, one after the other.
+        seeds: The seeds of the run, one after the other from the one that --seed gives.
         resume: Go on with the run that the folder holds; None if the command cannot.
 
     Raises:
@@ -42,9 +42,9 @@ def make_run(
     from garat_jax.earlier_run import earlier_run_kept, forget_earlier, put_back_earlier
     from garat_jax.runs import RunDirectory
 
-    for seed in (*seeds[:1], *seeds[-1:]):
-        if not 0 <= seed <= LARGEST_SEED:
-            raise UserError(f"--seed {seed}: expected 0 to {LARGEST_SEED}")
+    largest = LARGEST_SEED + 1 - len(seeds)
+    if seeds and not 0 <= seeds[0] <= largest:
+        raise UserError(f"--seed {seeds[0]}: expected 0 to {largest}")
     config = {
         field.name: getattr(command, field.name)
         for field in dataclasses.fields(command)
