@@ -90,9 +90,9 @@ def run_python(path: Path, option: str) -> ModuleType:
 
 
 def line_in(path: str | Path, error: BaseException) -> str:
-    """Return the last line of a file that an error came through, as ` line N`."""
+    """Return the last line of a file that an error came through, as ` line N`, or nothing."""
     if isinstance(error, SyntaxError):
-        return f" line {error.lineno}"
+        return f" line {error.lineno}" if error.lineno else ""  # a file with a NUL has none
     whole = os.path.abspath(path)  # as importlib names it
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename == whole]
     return f" line {frames[-1].lineno}" if frames else ""

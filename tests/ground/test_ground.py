@@ -81,6 +81,7 @@ def test_models_of_other_machines_are_not_compared(read, tmp_path):
         ("def policy(obs, key): return obs", r"expected an array of 1 command, shape \(1,\)"),
         ("def policy(obs, key): return obs[9:].nothing", "AttributeError"),
         ("def policy(obs", "line 1: SyntaxError"),
+        ("x = 1\n\0", r"mine.py: SyntaxError: source code .* null bytes"),
         ("def policy(obs, key):\n    return [float(obs[0])]", "line 2: .* Concretization"),
         ("def policy(obs, key):\n    return obs[:1] if obs[0] > 0 else 0", "line 2: .* jnp.where"),
         (
