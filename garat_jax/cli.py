@@ -178,7 +178,11 @@ def entry() -> NoReturn:
     """Run `garat` as the process that this is."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # what its encoding lacks is escaped, as on stderr
         sys.stdout.reconfigure(errors="backslashreplace")
-    status = main()
+    try:
+        status = main()
+    except BrokenPipeError:  # who reads the output has seen enough, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = FAILED
     if status == INTERRUPTED:  # XLA's threads may still call Python, which would no longer be there
         sys.stdout.flush()
         sys.stderr.flush()

@@ -64,6 +64,16 @@ def test_help_of_a_command_explains_every_option(name):
     assert "default: )" not in done.stdout
 
 
+@pytest.mark.parametrize("arguments", [["transfer", "--help"], ["list"], ["compare", "--help"]])
+def test_output_that_nobody_reads_ends_in_silence(arguments):
+    program = [sys.executable, "-m", "garat_jax", *arguments]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.close()
+        _, complaint = process.communicate(timeout=120)
+    assert (process.returncode, complaint) == (1, b"")
+
+
 def test_version():
     done = garat("--version")
     assert (done.returncode, done.stdout) == (0, "garat 0.1.0\n")
