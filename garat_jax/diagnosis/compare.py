@@ -25,6 +25,7 @@ from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, check_same_machine, load_model
+from garat_jax.diagnosis.oddities import commands_turned
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.quality import Quality, assess
@@ -174,6 +175,7 @@ def compare(
     qualities = tuple(assess(r, host, world) for r in recordings)
     torques = compare_torques(host, recordings, world)
     recordings = thin(recordings)
+    missing = missing_torque(host, recordings, world)
     grid = grid_for(recordings, host)
     simulator = Simulator(model, (), grid)
     say("choosing the horizon")
@@ -182,7 +184,7 @@ def compare(
     warnings = tuple(dict.fromkeys(w for r in recordings for w in r.warnings))
     warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, recordings, grid, stated)
-    warnings += (STILL,) if is_still(segments) else ()
+    warnings += (*commands_turned(missing), *((STILL,) if is_still(segments) else ()))
     played = {}
     for horizon in sorted({stated, *lasting_horizons(recordings)}):
         say(f"predicting over {horizon:g} s")
@@ -203,7 +205,7 @@ def compare(
         error=error,
         horizon=stated,
         horizons=_at_horizons(played),
-        where=tuple(localise(missing_torque(host, recordings, world))),
+        where=tuple(localise(missing)),
         residuals=examine(played[stated], recordings, element_names(host, "actuator")),
         torques=torques,
         recordings=qualities,

@@ -28,6 +28,7 @@ from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric, trusted
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.noise import signal_noise
+from garat_jax.diagnosis.oddities import commands_turned
 from garat_jax.diagnosis.own_effects import everywhere
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem
 from garat_jax.diagnosis.rank import Outcome, explain
@@ -38,7 +39,7 @@ from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
 from garat_jax.diagnosis.steps import fit_equals
 from garat_jax.diagnosis.suggest import suggest
-from garat_jax.diagnosis.unseen import is_still, unseen
+from garat_jax.diagnosis.unseen import HELD, is_still, unseen
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect, are_exclusive
 from garat_jax.errors import UserError
@@ -115,6 +116,9 @@ def diagnose_keeping(
     first = [c for c in outcome.candidates[:1] if c.why != NIL]
     explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
     verdict = verdict_of(outcome.adequate, outcome.selected, measured)
+    still, missing = is_still(problem.segments), missing_torque(host, everything, world)
+    if not outcome.adequate:
+        warnings += (*commands_turned(missing), *((HELD,) if still else ()))
     found = Diagnosis(
         model=str(model.path),
         data=tuple(r.name for r in fitted),
@@ -123,7 +127,7 @@ def diagnose_keeping(
         seconds=0.0,
         verdict=verdict,
         **measured._asdict(),
-        where=tuple(localise(missing_torque(host, everything, world))),
+        where=tuple(localise(missing)),
         candidates=outcome.candidates,
         selected=outcome.selected,
         ladder=_ladder(problem, outcome),
@@ -131,7 +135,7 @@ def diagnose_keeping(
         next_experiment=next_experiment((*outcome.selected, *first), host),
         warnings=warnings,
         unseen=unseen(problem, outcome.before, explaining),
-        still=is_still(problem.segments),
+        still=still,
         left=(),
         own=tuple(Named(e.kind, e.target) for e in sizable(model.without(shared))),
     )

@@ -1,4 +1,4 @@
-"""What is odd about a recording but usable: units that cannot well be, commands beyond limits.
+"""What is odd about a recording but usable: columns, units and samples that cannot well be right.
 
 Three things tell a unit. Measured velocity must be the derivative of measured position, mechanisms
 are sampled faster than twice a second, and a motion must be one that the model can nearly make.
@@ -13,7 +13,7 @@ import numpy as np
 
 from garat_jax.diagnosis.activation import never_forgetting
 from garat_jax.diagnosis.columns import actuator_names, signals
-from garat_jax.diagnosis.localise import missing_torque
+from garat_jax.diagnosis.localise import MissingTorque, missing_torque
 from garat_jax.diagnosis.units import UNITS
 from garat_jax.diagnosis.velocity import estimate_velocity
 from garat_jax.effects.at_joint import clamps
@@ -37,6 +37,16 @@ SAME = 1.5
 """Ratio of the two up to which they are in the same unit: gears and scales of sensors may err."""
 NEAR = 1.15
 """Factor within which a ratio is that of a unit."""
+OFF = 10.0
+"""How far a position is off its neighbours' line, relative to all but a twentieth of the others,
+and `FAR`, relative to all that it does, from which it is an error and no motion."""
+FAR = 0.02
+SURE = 30.0
+"""How far a position moves, relative to what noise does from a sample to the next, from which it
+is sure what its velocity is."""
+UNLIKE = 0.7
+"""What position does beside the integral of velocity, relative to what it does, from which that is
+no velocity of its own."""
 BETTER = 2.0
 """How much better the model must make the motion in degrees than the one in radians."""
 
@@ -61,6 +71,8 @@ def oddities(
     in_time = {dof: ratio * UNITS[clock].factor for dof, ratio in ratios.items()}
     by_velocity = _contradictions(in_time, model)
     lines += by_velocity.values()
+    lines += _unlike(recording, model, {*ratios})
+    lines += _off_for_a_sample(recording, model)
     told = {*by_velocity, *model.jnt_dofadr[list(wrapped)].tolist()}
     lines += _angles(recording, model, told, timed=clock == "s")
     lines += _commands(recording, model)
@@ -128,6 +140,92 @@ def _contradictions(ratios: dict[int, float], model: mujoco.MjModel) -> dict[int
             line += "; one of them, or time, is in another unit"
         found[dof] = line
     return found
+
+
+def _unlike(recording: "Recording", model: mujoco.MjModel, alike: set[int]) -> list[str]:
+    """Say which measured velocities of hinges and slides are none, but for dofs that are alike.
+
+    They are held against positions by their integral, which noise and coarse encoders hardly touch.
+    """
+    lines, listed = [], signals(model)
+    single = np.flatnonzero([DOFS_OF_JOINT[int(kind)] == 1 for kind in model.jnt_type])
+    for joint in single if recording.velocity_measured else ():
+        dof, place = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
+        if dof in alike:
+            continue
+        moves, rests, noisy = 0.0, 0.0, 0.0
+        for a, b in recording.spans:
+            time = recording.time[a:b]
+            position, speed = recording.qpos[a:b, place], recording.qvel[a:b, dof]
+            moved = np.concatenate([[0.0], np.cumsum(np.diff(time) * (speed[1:] + speed[:-1]) / 2)])
+            rests += np.sum(_without_line(time, position - moved) ** 2)
+            moves += np.sum(_without_line(time, position) ** 2)
+            noisy += np.sum(_off_neighbours(time, position) ** 2)
+        if moves > SURE**2 * noisy and rests > UNLIKE**2 * moves:
+            speed, what = listed[model.nq + dof].name, "is not the derivative"
+            if not recording.qvel[:, dof].any():
+                what = "is 0 throughout, which is not the derivative"
+            lines.append(
+                f"{speed} {what} of {listed[place].name}: leave the columns of velocities out, and "
+                "they are estimated, or see whether columns have been swapped"
+            )
+    return lines
+
+
+def _without_line(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values [T] less the line nearest to them."""
+    return values - np.polyval(np.polyfit(time, values, 1), time)
+
+
+def _off_neighbours(time: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return how far positions [T] are off the line through their neighbours, [T - 2]."""
+    part = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+    return position[1:-1] - position[:-2] - part * (position[2:] - position[:-2])
+
+
+def _off_for_a_sample(recording: "Recording", model: mujoco.MjModel) -> list[str]:
+    """Say which positions jump for a sample and back, as nothing moves."""
+    lines = []
+    for place, position in enumerate(recording.qpos.T):
+        jumps: list[tuple[float, float]] = []
+        for a, b in recording.spans:
+            off = _off_neighbours(recording.time[a:b], position[a:b])
+            least = max(OFF * np.quantile(np.abs(off), 0.95), FAR * np.ptp(position[a:b]))
+            beside = np.pad(off, 1)[:-2], np.pad(off, 1)[2:]
+            is_back = [(part * off < 0) & (np.abs(part) > np.abs(off) / 4) for part in beside]
+            at = np.flatnonzero((np.abs(off) > least) & is_back[0] & is_back[1])
+            jumps += [(float(recording.time[a + 1 + k]), float(off[k])) for k in at]
+        if jumps:
+            name, unit = signals(model)[place]
+            when = ", ".join(f"{time:.6g}" for time, _ in jumps[:5])
+            when += ", ..." if len(jumps) > 5 else ""
+            lines.append(
+                f"{name} is {max(jumps, key=lambda j: abs(j[1]))[1]:.3g}{' ' * bool(unit)}{unit} "
+                f"off its neighbours for a sample, at time {when}: leave such samples out, or they "
+                "count as noise"
+            )
+    return lines
+
+
+def commands_turned(missing: MissingTorque) -> list[str]:
+    """Say where the motion is that of the opposite commands, a line for each degree of freedom.
+
+    Twice what is commanded is missing there then, and hardly anything else.
+    """
+    lines = []
+    for name, torque, command in zip(
+        missing.dofs, missing.torque.T, missing.command.T, strict=True
+    ):
+        sizes = float(torque @ torque), float(command @ command)
+        product = float(torque @ command)
+        is_all = product**2 > ALIKE**2 * sizes[0] * sizes[1] > 0.0
+        if is_all and _is_near(-product / sizes[1], 2.0, SAME):
+            lines.append(
+                f"the torque that the model lacks at {name} is {product / sizes[1]:.3g} times what "
+                "is commanded there; do these commands count the other way? sign = -1 in a map "
+                "file (--map) turns them"
+            )
+    return lines
 
 
 def _position_of(dof: int, model: mujoco.MjModel) -> tuple[str, str]:

@@ -72,7 +72,10 @@ class Residuals:
         coloured = [w.signal for w in self.whiteness if not w.white]
         driven = [f"{i.signal} with {i.input}" for i in self.independence if not i.independent]
         if not coloured and not driven:
-            return "What the model leaves is white and independent of the commands: it is noise."
+            found = "What the model leaves is white and independent of the commands"
+            if small:
+                return f"{found}: it is noise."
+            return f"{found} by these tests, but too large for noise: few samples tell no pattern."
         lines = [f"not white: {', '.join(coloured)}"] if coloured else []
         lines += [f"goes with the commands: {', '.join(driven)}"] if driven else []
         found = "; ".join(lines)

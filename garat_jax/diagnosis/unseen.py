@@ -25,6 +25,11 @@ STILL = (
     "that a model may agree with them whatever it lacks"
 )
 """What is said of recordings in which nothing moves."""
+HELD = (
+    f"no signal moves by more than {QUIET:g} times its noise: what holds the machine where it is, "
+    "as a stop or friction at rest, can hardly be told from what would; record motion"
+)
+"""And where the model would move."""
 
 
 def is_still(segments: Segments) -> bool:

@@ -105,6 +105,12 @@ def test_what_is_odd_about_recordings_is_in_their_comparison_and_its_report(reco
     assert "Warning: run.csv: 1 gap." in page
 
 
+def test_commands_of_the_wrong_sign_are_told(recorded):
+    model, recordings = read(recorded, "none")
+    turned = [dataclasses.replace(recording, ctrl=-recording.ctrl) for recording in recordings]
+    assert "do these commands count the other way?" in compare(model, turned).warnings[0]
+
+
 def test_measured_torques_are_compared_where_there_are_any(recorded, tmp_path):
     model, recordings = read(recorded, "coulomb_friction")
     torque = {"hinge": recordings[0].ctrl[:, 0]}

@@ -17,6 +17,7 @@ from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
+from garat_jax.diagnosis.unseen import HELD
 from garat_jax.diagnosis.velocity import estimate_velocity
 from garat_jax.dynamics import native_model
 from garat_jax.effects import CATALOGUE, MotorGain
@@ -210,6 +211,9 @@ def test_it_is_said_where_nothing_moves():
     assert warn_of_rest([fast], [moves])
     model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
     assert warn_of_rest([moves], [noisy])[0] in diagnose(model, [moves], [noisy]).warnings
+    jammed = dataclasses.replace(noisy, qpos=noisy.qpos + 0.8)  # where the model would fall
+    assert HELD in diagnose(model, [jammed], [jammed]).warnings
+    assert HELD not in diagnose(model, [noisy], [noisy]).warnings
 
 
 SERVO = """

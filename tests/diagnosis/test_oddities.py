@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from garat_jax.diagnosis.hidden import make_recordings
+from garat_jax.diagnosis.localise import missing_torque
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.oddities import oddities
+from garat_jax.diagnosis.oddities import commands_turned, oddities
 from garat_jax.diagnosis.velocity import estimate_velocity
 from tests import models
 from tests.diagnosis import pendulum
@@ -111,6 +112,42 @@ def test_rotations_of_free_and_ball_joints_are_compared():
     lines = oddities(dataclasses.replace(recording, qvel=qvel), TUMBLER)
     assert ["qvel.free.0" in lines[0], "the derivative of qpos.free.0;" in lines[0]] == [True, True]
     assert "the derivative of the rotation in qpos.ball; is qvel.ball.2 in deg/s?" in lines[1]
+
+
+def changed(recording: Recording, **columns: np.ndarray) -> Recording:
+    return dataclasses.replace(recording, **columns)
+
+
+def test_a_position_that_jumps_for_a_sample_is_told_from_motion(good):
+    qpos = good.qpos.copy()
+    qpos[[100, 300]] += [[0.5], [-1.0]]
+    (line,) = oddities(changed(good, qpos=qpos), MODEL)
+    assert "qpos.hinge is -1 rad off its neighbours for a sample, at time 0.4, 1.2: leave" in line
+    coarse = changed(good, qpos=0.01 * np.round(good.qpos / 0.01))
+    kinked = changed(good, qpos=np.abs(good.qpos), qvel=np.sign(good.qpos) * good.qvel)
+    assert oddities(coarse, MODEL) == oddities(kinked, MODEL) == []
+
+
+def test_a_velocity_that_is_none_is_told_from_one_that_is_noisy(good):
+    nothing, swapped = np.zeros_like(good.qvel), changed(good, qpos=good.qvel, qvel=good.qpos)
+    (line,) = oddities(changed(good, qvel=nothing), MODEL)
+    assert "qvel.hinge is 0 throughout, which is not the derivative of qpos.hinge: leave" in line
+    (line,) = oddities(swapped, MODEL)
+    assert "qvel.hinge is not the derivative of qpos.hinge" in line
+    noise = np.random.default_rng(0).normal(size=good.qvel.shape)
+    noisy = changed(good, qvel=good.qvel + 2.0 * good.qvel.std() * noise)
+    rests = changed(good, qpos=1e-3 * noise, qvel=np.zeros_like(good.qvel))
+    assert oddities(noisy, MODEL) == oddities(rests, MODEL) == []
+
+
+def test_commands_that_count_the_other_way_are_told_from_a_weak_motor(good):
+    def lines(of: Recording) -> list[str]:
+        return commands_turned(missing_torque(MODEL, [of]))
+
+    (line,) = lines(changed(good, ctrl=-good.ctrl))
+    assert line.startswith("the torque that the model lacks at hinge is -")
+    assert lines(good) == lines(changed(good, ctrl=2.0 * good.ctrl)) == []
+    assert lines(changed(good, ctrl=0.0 * good.ctrl)) == []
 
 
 def test_good_recordings_pass_without_a_word(good, tmp_path):
