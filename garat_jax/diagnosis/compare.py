@@ -103,6 +103,8 @@ class Comparison:
     def sentence(self) -> str:
         """How large the error is, in one sentence."""
         error = self.error
+        if error.is_too_coarse and STILL in self.warnings:
+            return "The model cannot be judged: it moves, and in these recordings nothing does."
         if error.is_too_coarse:
             return error.coarseness
         size = f"{100 * error.before:.2g} % of the signals' spread"

@@ -95,7 +95,7 @@ def diagnose_keeping(
     say(say_horizon(everything, horizon))
     simulator = make_simulator(whole, grid)
     warnings = tuple(dict.fromkeys(w for r in (*recordings, *holdout) for w in r.warnings))
-    warnings += warn_of_rest(fitted, held_out)
+    warnings += warn_of_rest(fitted, held_out) + warn_of_copies(fitted, held_out)
     warnings += warn_of_sampling(grid, host.opt.timestep)
     warnings += warn_of_divergence(simulator, everything, grid, horizon)
     suggested = suggest(simulator.effects, host, fitted, world)
@@ -184,6 +184,17 @@ def warn_of_rest(fitted: Sequence[Recording], held_out: Sequence[Recording]) -> 
         f"nothing moves in what is {what} ({names}): no command changes, and no signal by more "
         f"than {QUIET:g} times its noise, so that little can be {why} there; record motion, or "
         "hold out others (--holdout)",
+    )
+
+
+def warn_of_copies(fitted: Sequence[Recording], held_out: Sequence[Recording]) -> tuple[str, ...]:
+    """Say which recordings that are held out have the samples of one that is fitted."""
+    return tuple(
+        f"{other.name} is held out and has the same samples as {one.name}, which is fitted: it "
+        "proves nothing; hold out another recording"
+        for one, other in itertools.product(fitted, held_out)
+        if one.spans == other.spans
+        and all(np.array_equal(*(getattr(r, x) for r in (one, other))) for x in ("qpos", "ctrl"))
     )
 
 

@@ -105,6 +105,14 @@ def test_what_is_odd_about_recordings_is_in_their_comparison_and_its_report(reco
     assert "Warning: run.csv: 1 gap." in page
 
 
+def test_no_smaller_timestep_is_asked_for_where_nothing_moves(recorded):
+    model, (recording, *_) = read(recorded, "none")
+    at = {"qpos": 0.5 + 0 * recording.qpos, "qvel": 0 * recording.qvel}
+    found = compare(model, [dataclasses.replace(recording, **at, ctrl=0 * recording.ctrl)])
+    assert found.error.is_too_coarse
+    assert found.sentence.endswith("it moves, and in these recordings nothing does.")
+
+
 def test_commands_of_the_wrong_sign_are_told(recorded):
     model, recordings = read(recorded, "none")
     turned = [dataclasses.replace(recording, ctrl=-recording.ctrl) for recording in recordings]

@@ -212,7 +212,9 @@ def test_it_is_said_where_nothing_moves():
     model = dataclasses.replace(MODEL, catalogue={"motor_gain": CATALOGUE["motor_gain"]})
     assert warn_of_rest([moves], [noisy])[0] in diagnose(model, [moves], [noisy]).warnings
     jammed = dataclasses.replace(noisy, qpos=noisy.qpos + 0.8)  # where the model would fall
-    assert HELD in diagnose(model, [jammed], [jammed]).warnings
+    found = diagnose(model, [jammed], [jammed])
+    assert HELD in found.warnings
+    assert "quiet is held out and has the same samples as quiet, which is" in found.warnings[0]
     assert HELD not in diagnose(model, [noisy], [noisy]).warnings
 
 
