@@ -1,9 +1,13 @@
-"""Files: written whole or not at all, and told apart by their names. No JAX."""
+"""Files: written whole or not at all, told apart by their names, TOML read. No JAX."""
 
 import contextlib
 import os
+import tomllib
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import Any
+
+from garat_jax.errors import UserError, unknown_name
 
 
 @contextlib.contextmanager
@@ -38,3 +42,30 @@ def distinct_names(paths: Collection[Path]) -> dict[Path, str]:
         if len({*names.values()}) == len({*whole.values()}):
             break
     return names
+
+
+def read_toml(path: Path, file_format: str, keys: Collection[str]) -> dict[str, Any]:
+    """Read a TOML file that names its format.
+
+    Args:
+        path: The file; it may begin with a byte order mark, as some editors write.
+        file_format: What its `format` has to be.
+        keys: Those that it may have.
+
+    Raises:
+        UserError: It cannot be read, is of another format, or has another key.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: no valid TOML: not UTF-8 text; save it as UTF-8") from error
+    except ValueError as error:
+        raise UserError(f"{path}: no valid TOML: {error}") from error
+    if content.get("format") != file_format:
+        raise UserError(f"{path}: format is {content.get('format')!r}; expected {file_format!r}")
+    for key in content:
+        if key not in keys:
+            raise UserError(f"{path}: {unknown_name('key', key, keys)}")
+    return content

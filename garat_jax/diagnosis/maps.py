@@ -5,7 +5,6 @@ unit = "deg", sign = -1, offset = 90 }`. The value is `(sign · scale · raw + o
 """
 
 import dataclasses
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 
 from garat_jax.diagnosis.units import UNITS, unit_of
 from garat_jax.errors import UserError, unknown_name
+from garat_jax.files import read_toml
 
 FORMAT = "garat-map/1"
 KEYS = ("format", "column", "clock")
@@ -90,17 +90,7 @@ def read_map(path: str | Path) -> ColumnMap:
         UserError: It cannot be read, or says something that cannot be.
     """
     path = Path(path)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from error
-    except ValueError as error:
-        raise UserError(f"{path}: no valid TOML: {error}") from error
-    if content.get("format") != FORMAT:
-        raise UserError(f"{path}: format is {content.get('format')!r}; expected {FORMAT!r}")
-    for key in content:
-        if key not in KEYS:
-            raise UserError(f"{path}: {unknown_name('key', key, KEYS)}")
+    content = read_toml(path, FORMAT, KEYS)
     clock = content.get("clock", CLOCKS[0])
     if clock not in CLOCKS:
         raise UserError(f"{path}: clock is {clock!r}; expected {' or '.join(CLOCKS)}")

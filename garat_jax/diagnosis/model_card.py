@@ -6,7 +6,6 @@ with `element name field value`, and `[[effect]]` tables with `kind target param
 
 import dataclasses
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from garat_jax.effects.catalogue import Catalogue, choose_kind, load_catalogue
 from garat_jax.effects.elements import element_names
 from garat_jax.env import Task, TaskEnv, Transform, World
 from garat_jax.errors import UserError, unknown_name
-from garat_jax.files import write_whole
+from garat_jax.files import read_toml, write_whole
 from garat_jax.overrides import load_spec
 
 FORMAT = "garat-model/1"
@@ -145,7 +144,7 @@ def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
     suffix = path.suffix.lower()
     if suffix not in (".xml", ".toml"):
         raise UserError(f"{path}: expected an MJCF file (.xml) or a model card (.toml)")
-    card = _read_toml(path) if suffix == ".toml" else {}
+    card = read_toml(path, FORMAT, CARD_KEYS) if suffix == ".toml" else {}
     mjcf = _mjcf_of(path, card) if suffix == ".toml" else path
     spec = load_spec(mjcf)
     try:
@@ -206,21 +205,6 @@ def mjcf_in_card(path: Path, model: Model) -> str:
             f"write the card to {model.mjcf.parent} or copy the model first"
         )
     return mjcf.relative_to(folder).as_posix()
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        card = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from error
-    except ValueError as error:
-        raise UserError(f"{path}: no valid TOML: {error}") from error
-    if card.get("format") != FORMAT:
-        raise UserError(f"{path}: format is {card.get('format')!r}; expected {FORMAT!r}")
-    for key in card:
-        if key not in CARD_KEYS:
-            raise UserError(f"{path}: {unknown_name('key', key, CARD_KEYS)}")
-    return card
 
 
 def _mjcf_of(path: Path, card: Mapping[str, Any]) -> Path:
