@@ -27,6 +27,7 @@ ROWS_NAMED = 5
 """How many bad rows a message names."""
 SEPARATORS = (",", ";", "\t")
 """Of a foreign CSV file: the one that its first line has most of."""
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*")
 _ARRAY = re.compile(r"(?P<name>[^\[\]]+)(\[(?P<column>\d+)\])?")
 
 
@@ -135,15 +136,30 @@ def check_samples(table: Table) -> None:
 
 
 def _read_csv(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
+    try:
+        return _columns_of_text(path, wanted)
+    except UnicodeError as error:
+        raise UserError(
+            f"{path}: cannot be read as CSV: not UTF-8 text; save it as UTF-8, and unpack it "
+            "first if it is compressed"
+        ) from error
+
+
+def _columns_of_text(path: Path, wanted: Collection[str] | None) -> dict[str, np.ndarray]:
     separator = ","
     with path.open(newline="", encoding="utf-8-sig") as file:
         first = file.readline()
+    if "\0" in first:
+        raise UnicodeError("zero bytes, as of UTF-16")
     if wanted is not None:
         separator = max(SEPARATORS, key=first.count)
     header = [name.strip() for name in next(csv.reader([first], delimiter=separator), [])]
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
         mark = "';'" if ";" in header[0] else "tabs"
-        raise UserError(f"{path}: columns are separated by {mark}; expected commas")
+        raise UserError(
+            f"{path}: columns are separated by {mark}; expected commas, or a map file: "
+            "--map MAP.toml, and garat convert, read these too"
+        )
     if all(_is_number(name) for name in header):
         holds = "holds numbers" if header else "is empty"
         raise UserError(
@@ -346,7 +362,8 @@ def _numbers(path: Path, frame: pd.DataFrame) -> dict[str, np.ndarray]:
             bad = values.notna().to_numpy()
         where = Table(path, {name: numbers}).rows(bad)
         first = str(values.iloc[int(np.flatnonzero(bad)[0])])
-        raise UserError(f"{path}: {name} holds {first!r} at {where}; expected numbers")
+        point = " with a decimal point, not a comma" if _DECIMAL_COMMA.fullmatch(first) else ""
+        raise UserError(f"{path}: {name} holds {first!r} at {where}; expected numbers{point}")
     return columns
 
 

@@ -56,6 +56,13 @@ def test_units_signs_and_offsets_by_hand(tmp_path, separator):
     np.testing.assert_allclose(recording.ctrl[:, 0], FOREIGN["torque"])
 
 
+def test_decimal_commas_are_named(tmp_path):
+    log = save(tmp_path, separator=";")
+    log.write_text(log.read_text().replace(".", ","))
+    with pytest.raises(UserError, match=r"holds '[-\d]+,\d+' at .* a decimal point, not a comma"):
+        Recording.read(log, MODEL, write(tmp_path))
+
+
 def test_parquet_takes_a_map_too(tmp_path):
     path = save(tmp_path, name="log.parquet")
     assert len(Recording.read(path, MODEL, read_map(write(tmp_path))).time) == 50
