@@ -44,6 +44,11 @@ class Override:
     field: str
     value: Any
 
+    @property
+    def place(self) -> str:
+        """What is changed, as a user reads it: `body/pole mass`."""
+        return f"{'/'.join(filter(None, (self.element, self.name)))} {self.field}"
+
     def apply(self, spec: mujoco.MjSpec) -> None:
         """Write the change into a spec.
 
@@ -62,6 +67,8 @@ class Override:
         try:
             if not _is_finite(value):
                 raise ValueError("not finite")
+            if type(current) in (int, float, np.ndarray) and _has_truth(value):
+                raise ValueError("no number")
             if self.element == "joint" and self.field in SPRUNG and np.any(target.springdamper):
                 raise UserError(
                     f"joint/{self.name} {self.field} follows from its springdamper; override that"
@@ -77,9 +84,8 @@ class Override:
         except UserError:
             raise
         except (TypeError, ValueError) as error:
-            where = "/".join(filter(None, (self.element, self.name)))
             raise UserError(
-                f"{where} {self.field} = {self.value!r}; expected {self._wanted(current)}"
+                f"{self.place} = {self.value!r}; expected {self._wanted(current)}"
             ) from error
 
     def _wanted(self, current: Any) -> str:
@@ -110,6 +116,13 @@ def _is_field(target: Any, name: str) -> bool:
     value = getattr(target, name)
     of_mujoco = type(value).__name__.startswith("mjt")
     return of_mujoco or isinstance(value, int | float | str | np.ndarray)
+
+
+def _has_truth(value: Any) -> bool:
+    """Say whether a value is, or holds, true or false."""
+    if isinstance(value, list | tuple):
+        return any(map(_has_truth, value))
+    return isinstance(value, bool) or np.asarray(value).dtype.kind == "b"
 
 
 def _is_finite(value: Any) -> bool:
@@ -173,7 +186,10 @@ def load_spec(mjcf: str | Path) -> mujoco.MjSpec:
     if not path.is_file():
         raise UserError(f"{path}: no such model file")
     try:
+        path.open("rb").close()  # MuJoCo takes what it may not read for an empty file
         return mujoco.MjSpec.from_file(str(path))
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}") from error
     except ValueError as error:
         raise UserError(f"{path}: {_line(error)}") from error
 

@@ -8,6 +8,7 @@ from garat_jax import dynamics
 from garat_jax.dynamics import Override
 from garat_jax.effects import ViscousDamping
 from garat_jax.errors import UserError
+from garat_jax.overrides import load_spec
 from tests.models import PENDULUM, spec
 
 
@@ -68,6 +69,9 @@ def test_options_that_are_words_in_mjcf_take_the_word_or_the_number():
             Override("option", "", "iterations", "many"),
             "iterations = 'many'; expected a whole number",
         ),
+        (Override("option", "", "timestep", True), "timestep = True; expected a finite number"),
+        (Override("option", "", "iterations", True), "iterations = True; expected a whole number"),
+        (Override("option", "", "gravity", [0, 0, True]), "expected 3 finite numbers"),
         (
             Override("joint", "hinge", "range", [0.0, float("inf")]),
             "expected 2 finite numbers",
@@ -116,3 +120,21 @@ def test_what_a_springdamper_decides_is_not_overridden():
     other = spec(sprung)
     Override("joint", "hinge", "springdamper", (1.0, 1.0)).apply(other)
     assert other.compile().jnt_stiffness[0] < spec(sprung).compile().jnt_stiffness[0]
+
+
+def test_what_is_true_or_false_takes_that():
+    for value in (True, False):
+        model = compiled(Override("actuator", "motor", "ctrllimited", value))
+        assert model.actuator_ctrllimited[0] == value
+
+
+def test_a_model_that_may_not_be_read_says_so(tmp_path, monkeypatch):
+    path = tmp_path / "pendulum.xml"
+    path.write_text(PENDULUM)
+
+    def refuse(*arguments):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(path), "open", refuse)  # root may read whatever its mode is
+    with pytest.raises(UserError, match=r"pendulum\.xml: Permission denied"):
+        load_spec(path)

@@ -149,6 +149,7 @@ def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
     spec = load_spec(mjcf)
     try:
         overrides = tuple(_override(table) for table in _tables(card, "override"))
+        _check_once(overrides)
         effects = tuple(_effect(table, catalogue) for table in _tables(card, "effect"))
         host = compile(spec, overrides, engine="mujoco").host.model
         for effect in effects:
@@ -213,6 +214,8 @@ def _mjcf_of(path: Path, card: Mapping[str, Any]) -> Path:
         raise UserError(
             f'{path}: mjcf is missing; expected mjcf = "FILE.xml", relative to the card'
         )
+    if Path(name).suffix.lower() != ".xml":
+        raise UserError(f"{path}: mjcf = {name!r}; expected an MJCF file (.xml)")
     mjcf = path.parent / name
     if Path(name).is_absolute() or not mjcf.resolve().is_relative_to(path.parent.resolve()):
         raise UserError(
@@ -245,6 +248,13 @@ def _override(table: dict[str, Any]) -> Override:
         if not isinstance(table[key], str):
             raise UserError(f"[[override]] {key} = {table[key]!r}; expected a name")
     return Override(**table)
+
+
+def _check_once(overrides: Sequence[Override]) -> None:
+    places = [override.place for override in overrides]
+    for number, place in enumerate(places):
+        if place in places[:number]:
+            raise UserError(f"{place} is overridden twice; write it once")
 
 
 def _effect(table: dict[str, Any], catalogue: Catalogue) -> Effect:

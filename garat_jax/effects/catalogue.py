@@ -108,7 +108,9 @@ def _add(catalogue: dict[str, type[Effect]], classes: Iterable[type[Effect]], or
     for cls in classes:
         _check(cls, origin)
         if cls.kind in catalogue:
-            raise UserError(f"{origin}: there is an effect {cls.kind!r} already; give it another")
+            raise UserError(
+                f"{origin}: there is an effect {cls.kind!r} already; give it another name"
+            )
         catalogue[cls.kind] = cls
 
 

@@ -26,6 +26,9 @@ target = "joint/elbow"
 parameters = { torque = 0.25 }
 """
 FRICTION = CARD[CARD.index("[[effect]]") :]
+MASS, STEP = (
+    "[[override]]" + table for table in CARD.removesuffix(FRICTION).split("[[override]]")[1:]
+)
 GEARS = "".join(
     f'[[effect]]\nkind = "{kind}"\ntarget = "joint/elbow"\nparameters = {{ {size} }}\n'
     for kind, size in (("backlash", "gap = 0.01"), ("joint_flexibility", "stiffness = 20.0"))
@@ -129,8 +132,9 @@ def test_card_elsewhere_is_refused(tmp_path):
         ('mjcf = "arm.xml"', "", "mjcf is missing"),
         ('mjcf = "arm.xml"', 'mjfc = "arm.xml"', "unknown key 'mjfc'; did you mean mjcf?"),
         ('"arm.xml"', '"../arm.xml"', "leaves the card's folder; put the model beside it"),
-        ('"arm.xml"', '"/etc/passwd"', "leaves the card's folder"),
+        ('"arm.xml"', '"/etc/arm.xml"', "leaves the card's folder"),
         ('"arm.xml"', '"leg.xml"', "no such model file"),
+        ('"arm.xml"', '"arm.toml"', "mjcf = 'arm.toml'; expected an MJCF file (.xml)"),
         ("[[override]]", "[override]", "no valid TOML"),
         ('"forearm"', '"forarm"', "unknown body 'forarm'; did you mean forearm?"),
         ('field = "mass"', 'field = "mas"', "did you mean mass"),
@@ -145,6 +149,9 @@ def test_card_elsewhere_is_refused(tmp_path):
         ("0.25", "nan", "coulomb_friction torque = nan; expected a finite number"),
         ("parameters = { torque = 0.25 }", "", "[[effect]] lacks parameters"),
         ("value = 1.3", "value = nan", "body/forearm mass = nan; expected a finite number"),
+        ("value = 1.3", "value = true", "body/forearm mass = True; expected a finite number"),
+        ("[[effect]]", MASS + "[[effect]]", "body/forearm mass is overridden twice; write it once"),
+        ("[[effect]]", STEP + "[[effect]]", "option timestep is overridden twice; write it once"),
         ("[[effect]]", FRICTION + "[[effect]]", "is at joint/elbow twice; write it once"),
         (
             "[[effect]]",

@@ -318,7 +318,7 @@ def test_a_law_is_tried_in_the_model_with_its_overrides(mine):
     [
         ("0.0, unit", "0.0 unit", "line 18: SyntaxError"),
         ("import jax\n", "import jaxx\n", "line 3: ModuleNotFoundError: No module named 'jaxx'"),
-        ('kind = "my_spring"', 'kind = "viscous_damping"', "'viscous_damping' already"),
+        ('kind = "my_spring"', 'kind = "viscous_damping"', "already; give it another name"),
         ('kind = "my_spring"', "", "Spring lacks kind"),
         ('    law = "tau = -k q"\n', "", "Spring lacks law"),
         ('("joint",)', '("joints",)', "elements is ('joints',); expected a tuple of body, joint"),
