@@ -3,6 +3,7 @@
 import dataclasses
 import html
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.diagnosis.units import after_number
 from garat_jax.dynamics import native_model
 from garat_jax.effects import Effect, are_exclusive, unit_at
-from garat_jax.effects.bounds import check_bounds
+from garat_jax.effects.bounds import ROUNDING, check_bounds
 from garat_jax.effects.catalogue import choose_kind
 from garat_jax.errors import UserError
 
@@ -47,6 +48,7 @@ class Sized(NamedTuple):
         error_after: The same with the effect.
         dead: Parameters that stay at no effect, because they change no signal.
         unsure: Those that act alone, and within whose interval no effect lies.
+        at_bound: Which bound those are at that may go no further: `lower` or `upper`.
     """
 
     effect: Effect
@@ -56,18 +58,26 @@ class Sized(NamedTuple):
     error_after: float
     dead: tuple[str, ...] = ()
     unsure: tuple[str, ...] = ()
+    at_bound: Mapping[str, str] = MappingProxyType({})
 
     def __str__(self) -> str:
-        sizes = [
-            f"{name} = {said(e)}{'; it may as well be no effect' if name in self.unsure else ''}"
-            for name, e in self.parameters.items()
-        ]
+        sizes = [f"{name} = {said(e)}{self._doubts(name)}" for name, e in self.parameters.items()]
         sizes += [
             f"{name} = {getattr(self.effect, name):.4g}: it stays at no effect, the recordings do "
             "not excite it"
             for name in self.dead
         ]
         return "\n".join([f"{self.effect.kind} at {self.effect.target}:", *sizes, self.change])
+
+    def _doubts(self, name: str) -> str:
+        """Say why a parameter's size is none to trust, if it is."""
+        doubts = []
+        if name in self.at_bound:
+            bound = self.at_bound[name]
+            doubts += [f"; it is at its {bound} bound, so the recordings ask for something else"]
+        if name in self.unsure:
+            doubts += ["; it may as well be no effect"]
+        return "".join(doubts)
 
     @property
     def change(self) -> str:
@@ -236,6 +246,7 @@ def size(
             for name in [p.name for p in effect.parameters()][: None if effect.independent else 1]
             if name in found and found[name].low <= none[name] <= found[name].high
         ),
+        at_bound=_at_bound(problem, best, none),
     )
 
 
@@ -249,6 +260,17 @@ def estimates(problem: Problem, fitted: Fit) -> dict[str, Estimate]:
         ends = float(fitted.low[place]), float(fitted.high[place])
         found[slot.parameter.name] = Estimate(float(fitted.theta[j]), *ends, unit)
     return found
+
+
+def _at_bound(problem: Problem, fitted: Fit, none: Mapping[str, float]) -> dict[str, str]:
+    """Name the bounds at which fitted parameters are, but for those that mean no effect."""
+    bounds = {}
+    for j in fitted.free:
+        parameter, value = problem.simulator.slots[j].parameter, fitted.theta[j]
+        for which, bound in (("lower", parameter.low), ("upper", parameter.high)):
+            if np.isclose(value, bound, ROUNDING, 0.0) and bound != none[parameter.name]:
+                bounds[parameter.name] = which
+    return bounds
 
 
 def _starts(problem: Problem, before: Fit, effect: Effect, given) -> list[np.ndarray]:

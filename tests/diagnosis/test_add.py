@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from garat_jax import cli
@@ -59,7 +60,7 @@ def test_a_fitted_effect_is_recovered_and_said(pendulum, recorded, capsys):
     assert effect.torque == pytest.approx(made.parameters["torque"], rel=0.05)
     printed = capsys.readouterr().out
     assert f"torque = {effect.torque:.4g} N m (95 %: " in printed
-    assert "no effect" not in printed
+    assert "no effect" not in printed and "bound" not in printed
     before, after = printed.rpartition("spread: ")[2].split()[0:3:2]
     assert float(after) < 0.3 * float(before)
 
@@ -71,6 +72,18 @@ def test_a_size_that_may_be_none_is_said(pendulum, recorded, capsys):
     more, fit = ["torque_offset", "--at", "joint/hinge"], ["--fit", *files]
     assert cli.main(["add", str(card), *more, *fit, "--out", str(card.with_name("two.toml"))]) == 0
     assert "); it may as well be no effect" in capsys.readouterr().out
+
+
+def test_a_size_at_its_bound_is_said(pendulum, recorded, capsys):
+    """Commands that count the other way ask for a gain below 0, which no motor has."""
+    table = pd.read_csv(recorded[1][0])
+    turned = pendulum.parent / "turned.csv"
+    table.assign(**{"ctrl.motor": -table["ctrl.motor"]}).to_csv(turned, index=False)
+    arguments = ["motor_gain", "--at", "actuator/motor", "--fit", str(turned)]
+    assert add(pendulum, *arguments)[0] == 0
+    printed = capsys.readouterr().out
+    assert "scale = 0.1 (95 %: " in printed
+    assert "); it is at its lower bound, so the recordings ask for something else" in printed
 
 
 def test_a_peak_above_a_friction_that_is_given_is_fitted(pendulum, recorded, capsys):
