@@ -1,6 +1,7 @@
 """Where compiled programs stay from one process to the next: JAX's persistent cache. No JAX."""
 
 import os
+import tempfile
 from pathlib import Path
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
@@ -21,6 +22,7 @@ def enable() -> None:
     try:
         folder = _user_cache() / "garat_jax" / "jax"
         folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()  # it may be there and another user's
     except (OSError, RuntimeError):  # no home, or none that can be written to
         return
     os.environ[FOLDER] = str(folder)

@@ -53,3 +53,12 @@ def test_without_a_folder_to_write_to_there_is_none(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     compilation_cache.enable()
     assert compilation_cache.folder() is None
+
+
+def test_without_leave_to_write_to_the_folder_there_is_none(monkeypatch, tmp_path):
+    """Not even root writes to a folder of the kernel's."""
+    (tmp_path / "garat_jax").mkdir()
+    (tmp_path / "garat_jax" / "jax").symlink_to("/proc/self", target_is_directory=True)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    compilation_cache.enable()
+    assert compilation_cache.folder() is None
