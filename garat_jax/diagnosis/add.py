@@ -21,7 +21,7 @@ from garat_jax.diagnosis.horizon import (
 )
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric
-from garat_jax.diagnosis.model_card import Model, make_effect
+from garat_jax.diagnosis.model_card import Model, check_model, make_effect
 from garat_jax.diagnosis.own_effects import try_own
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.segments import grid_for
@@ -131,6 +131,7 @@ def add(
     Raises:
         UserError: The effect, the place or a value cannot be, or nothing tells a size.
     """
+    check_model(model)
     values = values or {}
     effect = choose_effect(model, kind, target, values)
     if not values and not recordings:

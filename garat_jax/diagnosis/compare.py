@@ -24,7 +24,7 @@ from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, noise_floor
-from garat_jax.diagnosis.model_card import Model, check_same_machine, load_model
+from garat_jax.diagnosis.model_card import Model, check_model, check_same_machine, load_model
 from garat_jax.diagnosis.oddities import commands_turned
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.progress import tell
@@ -168,6 +168,8 @@ def compare(
         UserError: Another model has other joints or actuators, or there are no recordings.
     """
     started = time.monotonic()
+    for each in (model, *also):
+        check_model(each)
     recordings = checked(recordings)
     world = model.compile(engine="mujoco")
     host = native_model(world)

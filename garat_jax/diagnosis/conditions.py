@@ -23,7 +23,7 @@ from garat_jax.diagnosis.guesses import with_guesses
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording, checked
-from garat_jax.diagnosis.model_card import Model, save_card
+from garat_jax.diagnosis.model_card import Model, check_model, save_card
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.results import UNEXPLAINED, Diagnosis
 from garat_jax.diagnosis.segments import Segments, grid_for
@@ -113,8 +113,10 @@ def check_conditions(model: Model, conditions: Mapping[str, Sequence[Recording]]
     """Refuse recordings that cannot be diagnosed, before the base condition takes its time.
 
     Raises:
-        UserError: A condition has none, or too short ones, or samples too far apart.
+        UserError: A condition has none, or too short ones, or samples too far apart, or the model
+            is none.
     """
+    check_model(model)
     for name, measured in conditions.items():
         try:
             fitted, held_out, _ = split(checked(measured), ())

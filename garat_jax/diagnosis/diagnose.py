@@ -26,7 +26,7 @@ from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, checked
 from garat_jax.diagnosis.metric import make_metric, trusted
-from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.model_card import Model, check_model
 from garat_jax.diagnosis.noise import signal_noise
 from garat_jax.diagnosis.oddities import commands_turned
 from garat_jax.diagnosis.own_effects import everywhere
@@ -83,6 +83,7 @@ def diagnose_keeping(
     Args are those of `diagnose`.
     """
     started = time.monotonic()
+    check_model(model)
     fitted, held_out, how = split(checked(recordings), checked(holdout, least=0))
     everything = thin((*fitted, *held_out))
     whole = model.with_effects(shared)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.model_card import Model, check_model
 from garat_jax.effects import Effect, in_order
 from garat_jax.effects.joint import TorqueOffset
 from garat_jax.effects.motor_apart import Transmission
@@ -42,6 +42,7 @@ def export_mjcf(model: Model, path: str | Path) -> Exported:
         UserError: The file is one that the model is made of, or MuJoCo cannot compile or read back
             what was written.
     """
+    check_model(model)
     path = Path(path)
     if path.resolve() in (model.path.resolve(), model.mjcf.resolve()):
         raise UserError(f"{path} is what the model is made of; give another name")

@@ -22,7 +22,7 @@ from garat_jax.diagnosis.continuous import (
 )
 from garat_jax.diagnosis.filters import white_noise
 from garat_jax.diagnosis.maps import ColumnMap, read_map
-from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.model_card import Model, check_model
 from garat_jax.diagnosis.oddities import oddities
 from garat_jax.diagnosis.tables import FEWEST_SAMPLES, Table, check_samples, read_table
 from garat_jax.diagnosis.velocity import estimate_velocity
@@ -99,6 +99,8 @@ class Recording:
         """
         if isinstance(model, Model):
             model = native_model(model.compile(engine="mujoco"))
+        elif not isinstance(model, mujoco.MjModel):
+            check_model(model)
         if isinstance(column_map, str | Path):
             column_map = read_map(column_map)
         if not model.nq:

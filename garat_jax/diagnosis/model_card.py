@@ -122,6 +122,16 @@ def check_same_machine(
             )
 
 
+def check_model(model: Model) -> None:
+    """Refuse anything but a model, as its path is.
+
+    Raises:
+        UserError: It is something else.
+    """
+    if not isinstance(model, Model):
+        raise UserError(f"expected a model, not {model!r}; load_model(path) reads one")
+
+
 def load_model(path: str | Path, catalogue: Catalogue | None = None) -> Model:
     """Read an MJCF file (.xml) or a model card (.toml).
 
@@ -176,6 +186,7 @@ def save_card(path: str | Path, model: Model, extra_effects: Sequence[Effect] = 
     Raises:
         UserError: The card would lie outside the folder of the model's MJCF, or is no .toml file.
     """
+    check_model(model)
     path = Path(path)
     mjcf = mjcf_in_card(path, model)
     lines = [f"format = {_toml(FORMAT)}", f"mjcf = {_toml(mjcf)}"]

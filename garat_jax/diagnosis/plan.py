@@ -18,7 +18,7 @@ import plotly.graph_objects as go
 
 from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.measurements import Recording
-from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.model_card import Model, check_model
 from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
@@ -149,6 +149,7 @@ def plan(
         UserError: The model has no actuators or one without limits, an effect is unknown, they are
             the same, or one shows in nothing, or the length or the seed is out of range.
     """
+    check_model(model)
     if not SHORTEST <= seconds <= LONGEST:
         raise UserError(f"seconds {seconds:g}: expected {SHORTEST:g} to {LONGEST:g}")
     if seed < 0:

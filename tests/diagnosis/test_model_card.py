@@ -2,6 +2,16 @@
 
 import pytest
 
+from garat_jax import (
+    Recording,
+    add,
+    compare,
+    diagnose,
+    diagnose_conditions,
+    export_mjcf,
+    improve,
+    plan,
+)
 from garat_jax.diagnosis.model_card import load_model, save_card
 from garat_jax.dynamics import Override
 from garat_jax.effects import CATALOGUE, Backlash
@@ -183,3 +193,26 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path):
 def test_other_kinds_of_file_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"expected an MJCF file \(.xml\) or a model card"):
         load_model(tmp_path / "arm.urdf")
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda path: Recording.read("run.csv", path),
+        lambda path: diagnose(path, []),
+        lambda path: compare(path, []),
+        lambda path: compare(load_model(path), [], also=[path]),
+        lambda path: add(path, "viscous_damping", "joint/elbow", {"coefficient": 0.1}),
+        lambda path: improve(path, []),
+        lambda path: diagnose_conditions(path, [], {}),
+        lambda path: plan(path, "viscous_damping", "coulomb_friction"),
+        lambda path: save_card("new.toml", path),
+        lambda path: export_mjcf(path, "new.xml"),
+    ],
+)
+def test_a_path_for_a_model_is_refused(tmp_path, use):
+    path = str(write(tmp_path))
+    with pytest.raises(
+        UserError, match=r"expected a model, not '.*'; load_model\(path\) reads one"
+    ):
+        use(path)
