@@ -102,16 +102,16 @@ def needed_files(model: Model) -> list[Path]:
     Raises:
         UserError: The model needs a file outside the folder of its MJCF.
     """
-    source, files = model.mjcf.parent.resolve(), []
-    for name in mujoco.mju_getXMLDependencies(str(model.mjcf)):
-        file = Path(name).resolve()
-        if not file.is_relative_to(source):
-            raise UserError(
-                f"{model.mjcf} needs {file}, outside its folder, so it cannot be copied; "
-                "put it beside the model"
-            )
-        files.append(file.relative_to(source))
-    return files
+    source = model.mjcf.parent.resolve()
+    files = [Path(name).resolve() for name in mujoco.mju_getXMLDependencies(str(model.mjcf))]
+    outside = [file for file in files if not file.is_relative_to(source)]
+    if outside:
+        above = Path(os.path.commonpath([source, *outside]))
+        raise UserError(
+            f"{model.mjcf} needs {outside[0]}, outside its folder, so it cannot be copied; give "
+            f"the model that garat export {model.path} --out {above / model.mjcf.name} writes"
+        )
+    return [file.relative_to(source) for file in files]
 
 
 def copy_model(model: Model, folder: Path) -> Path:

@@ -266,12 +266,16 @@ def test_a_copied_model_has_all_its_files(tmp_path):
     ]  # fmt: skip
 
 
-def test_a_model_that_needs_files_elsewhere_is_not_copied(tmp_path):
+def test_a_model_that_needs_files_elsewhere_is_copied_once_it_is_exported_above_them(tmp_path):
     path = with_mesh(tmp_path / "model")
     (tmp_path / "model" / "parts" / "wedge.obj").rename(tmp_path / "wedge.obj")
     path.write_text(WITH_MESH.replace('"wedge.obj"', '"../../wedge.obj"'))
-    with pytest.raises(UserError, match="outside its folder, so it cannot be copied"):
+    with pytest.raises(UserError, match="outside its folder, so it cannot be copied") as refused:
         copy_model(load_model(path), tmp_path / "copy")
+    command = str(refused.value).partition("garat ")[2].removesuffix(" writes").split()
+    assert cli.main(command) == 0
+    copied = copy_model(load_model(command[-1]), tmp_path / "copy")
+    assert mujoco.MjModel.from_xml_path(str(copied)).nmesh == 1
 
 
 @pytest.mark.parametrize(
