@@ -30,7 +30,7 @@ def check_at_least(config: Any, **least: float) -> None:
         UserError: A number is smaller.
     """
     for name, number in least.items():
-        if getattr(config, name) < number:
+        if not getattr(config, name) >= number:  # NaN is none
             raise UserError(f"{name} is {getattr(config, name)}; expected {number} or more")
 
 

@@ -66,6 +66,7 @@ def test_settings_that_would_fail_at_the_end_are_refused_at_once(changed, said):
         (GROUNDING["gat"], {"num_transitions": 0}, "num_transitions is 0; expected 1 or more"),
         (GROUNDING["gat"], {"num_held_out": 0}, "num_held_out is 0; expected 1 or more"),
         (GROUNDING["gat"], {"episode": -1}, "episode is -1; expected 0 or more"),
+        (GROUNDING["gat"], {"episode": float("nan")}, "episode is nan; expected 0 or more"),
     ],
 )
 def test_settings_of_grounding_that_would_fail_in_it_are_refused_at_once(config, changed, said):

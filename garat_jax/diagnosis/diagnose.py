@@ -118,8 +118,10 @@ def diagnose_keeping(
     explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
     verdict = verdict_of(outcome.adequate, outcome.selected, measured)
     still, missing = is_still(problem.segments), missing_torque(host, everything, world)
-    if not outcome.adequate:
-        warnings += (*commands_turned(missing), *((HELD,) if still else ()))
+    if not measured.error.is_near_floor:
+        warnings += tuple(commands_turned(missing))
+    if still and not outcome.adequate:
+        warnings += (HELD,)
     found = Diagnosis(
         model=str(model.path),
         data=tuple(r.name for r in fitted),

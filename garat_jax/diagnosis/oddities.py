@@ -41,6 +41,12 @@ OFF = 10.0
 """How far a position is off its neighbours' line, relative to all but a twentieth of the others,
 and `FAR`, relative to all that it does, from which it is an error and no motion."""
 FAR = 0.02
+FLICKER = 3.0
+"""Ticks of an encoder that a position may be off its neighbours' line all the same."""
+TICKS = 10.0
+"""Ticks that it has to move by for its velocity to be held against it."""
+SPRINGY = 0.8
+"""Cosine between a missing torque and the position from which a spring may be what is missing."""
 SURE = 30.0
 """How far a position moves, relative to what noise does from a sample to the next, from which it
 is sure what its velocity is."""
@@ -145,23 +151,29 @@ def _contradictions(ratios: dict[int, float], model: mujoco.MjModel) -> dict[int
 def _unlike(recording: "Recording", model: mujoco.MjModel, alike: set[int]) -> list[str]:
     """Say which measured velocities of hinges and slides are none, but for dofs that are alike.
 
-    They are held against positions by their integral, which noise and coarse encoders hardly touch.
+    Their integral is held against positions, beyond what their noise adds up to. One that is like
+    the positions in another unit is a velocity.
     """
     lines, listed = [], signals(model)
     single = np.flatnonzero([DOFS_OF_JOINT[int(kind)] == 1 for kind in model.jnt_type])
     for joint in single if recording.velocity_measured else ():
         dof, place = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
-        if dof in alike:
-            continue
-        moves, rests, noisy = 0.0, 0.0, 0.0
+        sums, noisy, walks, is_coarse = np.zeros(3), 0.0, 0.0, True
         for a, b in recording.spans:
             time = recording.time[a:b]
             position, speed = recording.qpos[a:b, place], recording.qvel[a:b, dof]
             moved = np.concatenate([[0.0], np.cumsum(np.diff(time) * (speed[1:] + speed[:-1]) / 2)])
-            rests += np.sum(_without_line(time, position - moved) ** 2)
-            moves += np.sum(_without_line(time, position) ** 2)
+            both = _without_line(time, position), _without_line(time, moved)
+            sums += both[0] @ both[0], both[0] @ both[1], both[1] @ both[1]
             noisy += np.sum(_off_neighbours(time, position) ** 2)
-        if moves > SURE**2 * noisy and rests > UNLIKE**2 * moves:
+            noise = np.sum(_off_neighbours(time, speed) ** 2) * np.median(np.diff(time)) ** 2
+            walks += noise * len(time)
+            is_coarse &= bool(np.ptp(position) < TICKS * _tick(position))
+        moves, product, integral = sums
+        rests = moves - 2.0 * product + integral - walks
+        is_clear = moves > SURE**2 * noisy and not is_coarse
+        is_like = product**2 > ALIKE**2 * moves * integral
+        if dof not in alike and is_clear and not is_like and rests > UNLIKE**2 * moves:
             speed, what = listed[model.nq + dof].name, "is not the derivative"
             if not recording.qvel[:, dof].any():
                 what = "is 0 throughout, which is not the derivative"
@@ -170,6 +182,12 @@ def _unlike(recording: "Recording", model: mujoco.MjModel, alike: set[int]) -> l
                 "they are estimated, or see whether columns have been swapped"
             )
     return lines
+
+
+def _tick(position: np.ndarray) -> float:
+    """Return the smallest step from a sample to the next, an encoder's or less; 0 for none."""
+    steps = np.abs(np.diff(position))
+    return float(steps[steps > 0.0].min(initial=np.inf)) if steps.any() else 0.0
 
 
 def _without_line(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -191,41 +209,48 @@ def _off_for_a_sample(recording: "Recording", model: mujoco.MjModel) -> list[str
         for a, b in recording.spans:
             off = _off_neighbours(recording.time[a:b], position[a:b])
             least = max(OFF * np.quantile(np.abs(off), 0.95), FAR * np.ptp(position[a:b]))
+            least = max(least, FLICKER * _tick(position[a:b]))
             beside = np.pad(off, 1)[:-2], np.pad(off, 1)[2:]
             is_back = [(part * off < 0) & (np.abs(part) > np.abs(off) / 4) for part in beside]
             at = np.flatnonzero((np.abs(off) > least) & is_back[0] & is_back[1])
-            jumps += [(float(recording.time[a + 1 + k]), float(off[k])) for k in at]
+            since = recording.time - recording.time[0]
+            jumps += [(float(since[a + 1 + k]), float(off[k])) for k in at]
         if jumps:
             name, unit = signals(model)[place]
             when = ", ".join(f"{time:.6g}" for time, _ in jumps[:5])
             when += ", ..." if len(jumps) > 5 else ""
             lines.append(
                 f"{name} is {max(jumps, key=lambda j: abs(j[1]))[1]:.3g}{' ' * bool(unit)}{unit} "
-                f"off its neighbours for a sample, at time {when}: leave such samples out, or they "
-                "count as noise"
+                f"off its neighbours for a sample, {when} s after the start: leave such samples "
+                "out, or they count as noise"
             )
     return lines
 
 
 def commands_turned(missing: MissingTorque) -> list[str]:
-    """Say where the motion is that of the opposite commands, a line for each degree of freedom.
+    """Say where the motion may be that of the opposite commands, a line for each dof.
 
-    Twice what is commanded is missing there then, and hardly anything else.
+    Twice what is commanded is missing there then, and hardly anything else; but where it also goes
+    with the position a spring may be missing.
     """
     lines = []
-    for name, torque, command in zip(
-        missing.dofs, missing.torque.T, missing.command.T, strict=True
-    ):
-        sizes = float(torque @ torque), float(command @ command)
-        product = float(torque @ command)
-        is_all = product**2 > ALIKE**2 * sizes[0] * sizes[1] > 0.0
-        if is_all and _is_near(-product / sizes[1], 2.0, SAME):
+    parts = missing.torque.T, missing.command.T, missing.position.T
+    for name, torque, command, position in zip(missing.dofs, *parts, strict=True):
+        size = float(command @ command)
+        ratio = float(torque @ command) / size if size > 0.0 else 0.0
+        springy = abs(_cosine(torque, position - position.mean())) > SPRINGY
+        if abs(_cosine(torque, command)) > ALIKE and _is_near(-ratio, 2.0) and not springy:
             lines.append(
-                f"the torque that the model lacks at {name} is {product / sizes[1]:.3g} times what "
-                "is commanded there; do these commands count the other way? sign = -1 in a map "
-                "file (--map) turns them"
+                f"the torque that the model lacks at {name} is {ratio:.3g} times what is commanded "
+                "there; do these commands count the other way? sign = -1 in a map file (--map) "
+                "turns them"
             )
     return lines
+
+
+def _cosine(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the cosine of two vectors' angle, 0 if either is zero."""
+    return float(a @ b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
 
 
 def _position_of(dof: int, model: mujoco.MjModel) -> tuple[str, str]:

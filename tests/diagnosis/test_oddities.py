@@ -122,10 +122,18 @@ def test_a_position_that_jumps_for_a_sample_is_told_from_motion(good):
     qpos = good.qpos.copy()
     qpos[[100, 300]] += [[0.5], [-1.0]]
     (line,) = oddities(changed(good, qpos=qpos), MODEL)
-    assert "qpos.hinge is -1 rad off its neighbours for a sample, at time 0.4, 1.2: leave" in line
+    assert (
+        "qpos.hinge is -1 rad off its neighbours for a sample, 0.4, 1.2 s after the start: leave"
+        in line
+    )
     coarse = changed(good, qpos=0.01 * np.round(good.qpos / 0.01))
     kinked = changed(good, qpos=np.abs(good.qpos), qvel=np.sign(good.qpos) * good.qvel)
     assert oddities(coarse, MODEL) == oddities(kinked, MODEL) == []
+    held = np.zeros_like(good.qpos)
+    held[[100, 300, 500]] = 1e-3  # an encoder flickers by a tick
+    flickers = changed(good, qpos=held, qvel=0 * held)
+    creeps = changed(good, qpos=np.where(good.time[:, None] > 1.5, 1e-3, 0.0), qvel=0 * held)
+    assert oddities(flickers, MODEL) == oddities(creeps, MODEL) == []
 
 
 def test_a_velocity_that_is_none_is_told_from_one_that_is_noisy(good):
@@ -137,7 +145,10 @@ def test_a_velocity_that_is_none_is_told_from_one_that_is_noisy(good):
     noise = np.random.default_rng(0).normal(size=good.qvel.shape)
     noisy = changed(good, qvel=good.qvel + 2.0 * good.qvel.std() * noise)
     rests = changed(good, qpos=1e-3 * noise, qvel=np.zeros_like(good.qvel))
-    assert oddities(noisy, MODEL) == oddities(rests, MODEL) == []
+    other_unit = changed(good, qvel=(good.qvel + 2.0 * good.qvel.std() * noise) / DEGREE)
+    drowned = changed(good, qpos=0.01 * good.qpos, qvel=0.01 * good.qvel + noise)
+    for odd in (noisy, rests, other_unit, drowned):
+        assert oddities(odd, MODEL) == []
 
 
 def test_commands_that_count_the_other_way_are_told_from_a_weak_motor(good):
@@ -148,6 +159,11 @@ def test_commands_that_count_the_other_way_are_told_from_a_weak_motor(good):
     assert line.startswith("the torque that the model lacks at hinge is -")
     assert lines(good) == lines(changed(good, ctrl=2.0 * good.ctrl)) == []
     assert lines(changed(good, ctrl=0.0 * good.ctrl)) == []
+    swing = 0.3 * np.sin(2.0 * good.time)
+    slow = changed(good, qpos=swing[:, None], qvel=(0.6 * np.cos(2.0 * good.time))[:, None])
+    load = missing_torque(MODEL, [changed(slow, ctrl=0.0 * good.ctrl)])
+    pushed = np.interp(good.time, load.time, load.torque[:, 0] - 2.0 * load.torque[:, 0])
+    assert lines(changed(slow, ctrl=pushed[:, None])) == []  # a spring of twice the stiffness
 
 
 def test_good_recordings_pass_without_a_word(good, tmp_path):
