@@ -23,7 +23,7 @@ from garat_jax.diagnosis.horizon import (
 from garat_jax.diagnosis.localise import Place, localise, missing_torque
 from garat_jax.diagnosis.maps import read_map
 from garat_jax.diagnosis.measurements import Recording, checked
-from garat_jax.diagnosis.metric import ABOVE_FLOOR, make_metric, noise_floor
+from garat_jax.diagnosis.metric import ABOVE_FLOOR, Errors, make_metric, noise_floor
 from garat_jax.diagnosis.model_card import Model, check_model, check_same_machine, load_model
 from garat_jax.diagnosis.oddities import commands_turned
 from garat_jax.diagnosis.problem import Problem
@@ -31,7 +31,6 @@ from garat_jax.diagnosis.progress import tell
 from garat_jax.diagnosis.quality import Quality, assess
 from garat_jax.diagnosis.replay import Replay, Size, lasting_horizons, replay, replay_with
 from garat_jax.diagnosis.residuals import Residuals, examine
-from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import Grid, grid_for
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle

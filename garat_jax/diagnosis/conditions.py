@@ -23,9 +23,10 @@ from garat_jax.diagnosis.guesses import with_guesses
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer
 from garat_jax.diagnosis.judge import estimates
 from garat_jax.diagnosis.measurements import Recording, checked
+from garat_jax.diagnosis.metric import UNEXPLAINED
 from garat_jax.diagnosis.model_card import Model, check_model, save_card
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import UNEXPLAINED, Diagnosis
+from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.diagnosis.segments import Segments, grid_for
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.slots import Slot

@@ -10,13 +10,12 @@ from garat_jax.diagnosis.findings import Candidate, Interval, Named
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.judge import (
     NO_CERTAIN_GAIN,
-    SMALLEST_SHARE,
     STABLE,
     Judged,
     block_costs,
     fall,
 )
-from garat_jax.diagnosis.metric import Metric
+from garat_jax.diagnosis.metric import SMALLEST_SHARE, Metric
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem
 from garat_jax.diagnosis.starts import Fit
 

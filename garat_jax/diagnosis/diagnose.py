@@ -21,11 +21,11 @@ from garat_jax.diagnosis.horizon import (
     warn_of_divergence,
     warn_of_sampling,
 )
-from garat_jax.diagnosis.judge import NIL, SMALLEST_SHARE, is_enough
+from garat_jax.diagnosis.judge import NIL, is_enough
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording, checked
-from garat_jax.diagnosis.metric import make_metric, trusted
+from garat_jax.diagnosis.metric import SMALLEST_SHARE, make_metric, trusted
 from garat_jax.diagnosis.model_card import Model, check_model
 from garat_jax.diagnosis.noise import signal_noise
 from garat_jax.diagnosis.oddities import commands_turned
@@ -111,12 +111,13 @@ def diagnose_keeping(
     warnings += too_few
     warnings += warn_of_fitted(problem, outcome.before, host) if outcome.adequate else ()
     fits = outcome.before, outcome.after
-    measured = measure_held_out(problem, fits, outcome.floor, everything, grid, how)
+    floor, selected = outcome.floor, outcome.selected
+    measured = measure_held_out(problem, fits, floor, everything, grid, how, selected)
     if not measured.error.is_too_coarse:
-        warnings += warn_of_timestep(problem, outcome.floor, host)
+        warnings += warn_of_timestep(problem, floor, host)
     first = [c for c in outcome.candidates[:1] if c.why != NIL]
     explaining = {c.named for c in outcome.candidates if c.share >= SMALLEST_SHARE}
-    verdict = verdict_of(outcome.adequate, outcome.selected, measured)
+    verdict = verdict_of(outcome.adequate, selected, measured)
     still, missing = is_still(problem.segments), missing_torque(host, everything, world)
     if not measured.error.is_near_floor:
         warnings += tuple(commands_turned(missing))
@@ -132,17 +133,17 @@ def diagnose_keeping(
         **measured._asdict(),
         where=tuple(localise(missing)),
         candidates=outcome.candidates,
-        selected=outcome.selected,
+        selected=selected,
         ladder=_ladder(problem, outcome),
         drifts=() if too_few else _drifts(problem, outcome, everything, verdict, say),
-        next_experiment=next_experiment((*outcome.selected, *first), host),
+        next_experiment=next_experiment((*selected, *first), host),
         warnings=warnings,
         unseen=unseen(problem, outcome.before, explaining),
         still=still,
         left=(),
         own=tuple(Named(e.kind, e.target) for e in sizable(model.without(shared))),
     )
-    is_seen = found.is_left and found.decisive is not found.finer
+    is_seen = found.is_left and not found.is_gap_finer
     left = leftover(problem, outcome.after, everything, host) if is_seen else ()
     found = dataclasses.replace(found, left=tuple(left), seconds=time.monotonic() - started)
     return found, simulator

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from garat_jax.diagnosis.differences import clear_differences
+from garat_jax.diagnosis.findings import DELAYS
 from garat_jax.diagnosis.metric import timestep_error
 from garat_jax.diagnosis.problem import Problem, StartSpace, block_labels, tall
 from garat_jax.diagnosis.robust import orthonormal, wald_test, without
@@ -18,8 +19,6 @@ from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.slots import columns_of
 from garat_jax.diagnosis.starts import Fit
 
-DELAYS = ("actuator_delay", "sensor_delay")
-"""Kinds that a common delay stands for: it is no nuisance to them."""
 OFFSETS = (
     "torque_offset", "gravity_scale", "gravity_tilt", "payload_mass", "com_offset",
     "joint_stiffness", "encoder_offset",

@@ -6,6 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 from garat_jax.diagnosis.units import after_number
 
+DELAYS = ("actuator_delay", "sensor_delay")
+"""Kinds that a common delay stands for: it is no nuisance to them."""
+TIMINGS = (*DELAYS, "actuator_lag")
+"""Effects that may stand for a delay where the recordings do not tell them from one."""
 MOST_NAMED = 4
 """Effects that a sentence names at most: of rivals, or of those that recordings cannot show."""
 
@@ -119,6 +123,12 @@ class Candidate:
     def named(self) -> Named:
         """The effect and its place."""
         return Named(self.effect, self.target)
+
+    @property
+    def is_delay(self) -> bool:
+        """Whether it is, or for all that the recordings tell may be, a delay."""
+        alike = {named.effect for named in (self.named, *self.indistinguishable_from)}
+        return self.effect in TIMINGS and not alike.isdisjoint(DELAYS)
 
     @property
     def sizes(self) -> str:

@@ -8,9 +8,11 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.columns import signals
+from garat_jax.diagnosis.findings import Candidate, Named
 from garat_jax.diagnosis.horizon import cut_longest
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.metric import (
+    Errors,
     Floor,
     Metric,
     make_metric,
@@ -20,7 +22,6 @@ from garat_jax.diagnosis.metric import (
     trusted,
 )
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import Grid
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.diagnosis.timestep import REFINEMENTS, at_finer_timestep
@@ -36,11 +37,14 @@ class HeldOut(NamedTuple):
         error: Over the segments that were fitted, at the model's timestep.
         longest: Over the longest segments; see `longest_errors`.
         finer: At a finer timestep; see `finer_errors`.
+        on_time: As `error`, or as `finer` where that was measured, but `before` of the model with
+            the delays alone that were found.
     """
 
     error: Errors
     longest: Errors | None = None
     finer: Errors | None = None
+    on_time: Errors | None = None
 
     @property
     def are_explained(self) -> bool:
@@ -55,8 +59,12 @@ def measure_held_out(
     recordings: Sequence[Recording],
     grid: Grid,
     how: str,
+    selected: Sequence[Candidate] = (),
 ) -> HeldOut:
     """Return the held-out errors of the model as it is and with what was found.
+
+    A delay may make nearly all of the error and is no part of the mechanism: where one was found,
+    what is left is held against what the delay alone leaves, too.
 
     Those at a finer timestep are measured where something was found that explains the others, and
     the integrator's error is above the noise.
@@ -68,14 +76,33 @@ def measure_held_out(
         recordings: What was measured.
         grid: The simulated steps.
         how: Names the recordings that are held out.
+        selected: What was found.
     """
-    after = fits[1]
+    after, delays = fits[1], [c.named for c in selected if c.is_delay]
     error = errors_of(problem, fits, floor, how)
-    found = HeldOut(error, longest_errors(problem, after.theta, recordings, grid, how))
+    longest = longest_errors(problem, after.theta, recordings, grid, how)
+    found = HeldOut(error, longest, None, _errors_on_time(problem, after, delays, floor, how))
     is_found = np.any(after.theta != problem.simulator.base)
     if not (is_found and error.integrator_exceeds_noise and found.are_explained):
         return found
-    return found._replace(finer=finer_errors(problem, after, how))
+    finer, on_time = finer_errors(problem, after, how, delays)
+    return found._replace(finer=finer, on_time=on_time or found.on_time)
+
+
+def _errors_on_time(
+    problem: Problem, after: Fit, delays: Sequence[Named], floor: Floor, how: str
+) -> Errors | None:
+    """Return the errors as if the model had had the delays from the start; None without any."""
+    if not delays:
+        return None
+    simulator, theta = problem.simulator, problem.simulator.base.copy()
+    for j, slot in enumerate(simulator.slots):
+        effect = simulator.effects[slot.effect]
+        if Named(effect.kind, effect.target) in delays:
+            theta[j] = after.theta[j]
+    alone = np.array_equal(theta, after.theta)
+    before = after if alone else settle(problem, theta, after.start)
+    return errors_of(problem, (before, after), floor, how)
 
 
 def errors_of(
@@ -154,8 +181,12 @@ def longest_errors(
 
 
 def finer_errors(
-    problem: Problem, after: Fit, how: str, refinements: int = REFINEMENTS
-) -> Errors | None:
+    problem: Problem,
+    after: Fit,
+    how: str,
+    delays: Sequence[Named] = (),
+    refinements: int = REFINEMENTS,
+) -> tuple[Errors | None, Errors | None]:
     """Return the errors at a finer timestep, down to one whose own error noise hides.
 
     What stays unexplained may show there alone: at the model's timestep the integrator's error,
@@ -166,10 +197,12 @@ def finer_errors(
         problem: The recordings, cut as they were fitted.
         after: The fit of what was found, as near to a timestep of 0 as it could be taken.
         how: Names the recordings that are held out.
+        delays: Those that were found.
         refinements: How often the timestep is refined at most.
 
     Returns:
-        None where the integrator's error would hide any other there, too.
+        The errors, and those as if the model had had the delays; None where the integrator's error
+        would hide any other there, too.
     """
     held_out = np.flatnonzero(~problem.fitted)
     finer, near = at_finer_timestep(problem.take(held_out), after.take(held_out))
@@ -177,10 +210,11 @@ def finer_errors(
     before = settle(finer, finer.simulator.base, finer.segments.start)
     floor = noise_floor(finer, make_metric(finer), near)
     errors = errors_of(finer, (before, near), floor, how)
-    found = None if errors.is_too_coarse else errors
+    found = errors, _errors_on_time(finer, near, delays, floor, how)
     if errors.integrator_exceeds_noise and refinements > 1:
-        return finer_errors(finer, near, how, refinements - 1) or found
-    return found
+        finest = finer_errors(finer, near, how, delays, refinements - 1)
+        found = finest if finest[0] else found
+    return (None, None) if errors.is_too_coarse and found[0] is errors else found
 
 
 def warn_of_timestep(problem: Problem, floor: Floor, host: mujoco.MjModel) -> tuple[str, ...]:

@@ -209,7 +209,7 @@ def _ladder(
         for candidate, f in zip((None, *added), fits, strict=True)
     )
     floor = noise_floor(problem, metric, fits[-1])
-    measured = measure_held_out(problem, (fits[0], fits[-1]), floor, everything, grid, how)
+    measured = measure_held_out(problem, (fits[0], fits[-1]), floor, everything, grid, how, added)
     if few_segments(problem) or not is_above(problem, metric, fits[-1], floor):
         return rungs, measured, ()
     whole = dataclasses.replace(fits[-1], free=tuple(sized_columns(simulator, added)))

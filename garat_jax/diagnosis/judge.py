@@ -7,7 +7,14 @@ import numpy as np
 
 from garat_jax.diagnosis.contend import Contender, refines
 from garat_jax.diagnosis.findings import Candidate, Estimate, Interval, Named
-from garat_jax.diagnosis.metric import AT_FLOOR, Floor, Metric, is_above, noise_floor
+from garat_jax.diagnosis.metric import (
+    AT_FLOOR,
+    SMALLEST_SHARE,
+    Floor,
+    Metric,
+    is_above,
+    noise_floor,
+)
 from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, Problem, block_labels
 from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine
@@ -15,8 +22,6 @@ from garat_jax.diagnosis.starts import Fit
 from garat_jax.effects import Parameter
 from garat_jax.effects.units import unit_at
 
-SMALLEST_SHARE = 0.05
-"""Share of the residual that an effect must explain."""
 SIGNIFICANCE = 0.01
 """Largest corrected p-value."""
 STABLE = 0.8

@@ -1,6 +1,8 @@
 """The error that a diagnosis reports, and the floor that noise and the integrator set it."""
 
 import dataclasses
+import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +18,112 @@ AT_FLOOR = 1.1
 """Multiple of the noise floor up to which a fit leaves nothing for another law to explain."""
 TRUSTED = 3.0
 """Standard deviations of noise that the timestep's error may reach before a sample counts less."""
+TOO_COARSE = 1.0 / ABOVE_FLOOR
+"""Integrator's error, relative to the signals' spread, above which a model that is as bad as always
+predicting the mean would be near the floor."""
+UNEXPLAINED = 0.3
+"""Share of the error that may stay, however near to the noise floor that is."""
+SMALLEST_SHARE = 0.05
+"""Share of the residual that an effect must explain, and of the error that always may stay."""
 FINE = 8
 """Physics substeps in place of each that say the timestep's error past contacts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Errors:
+    """Held-out prediction error.
+
+    Attributes:
+        metric: How it is measured, the horizon among it.
+        unit: "1": relative to each signal's standard deviation; see `segments.metric_spread`.
+        before: Of the model as it is.
+        after: With every selected effect.
+        noise_floor: What noise and the integrator's own error make.
+        unexplained_share: What is left above the floor, over `before`; 1 if that is too coarse.
+        per_signal: By signal: before, after, noise_floor and the signal's unit, in that unit.
+        timestep: Seconds of a step of the physics.
+        integrator: What the integrator's error alone makes at this timestep.
+        horizon: Seconds of the segments that are predicted.
+        above_floor: The signals whose error stays well above their noise floor.
+    """
+
+    metric: str
+    unit: str
+    before: float
+    after: float
+    noise_floor: float
+    unexplained_share: float
+    per_signal: Mapping[str, Mapping[str, float | str]]
+    timestep: float = math.nan
+    integrator: float = 0.0
+    horizon: float = math.nan
+    above_floor: tuple[str, ...] = ()
+
+    @classmethod
+    def above(
+        cls,
+        floor: float,
+        of_noise: float,
+        *,
+        metric: str,
+        horizon: float,
+        before: float,
+        after: float,
+        timestep: float,
+        per_signal: Mapping[str, Mapping[str, float | str]],
+        above_floor: tuple[str, ...] = (),
+    ) -> "Errors":
+        """Hold errors against their floor, of which noise alone makes `of_noise`.
+
+        A model may err more than predicting the mean would, 1; what is left is then held against
+        that.
+        """
+        integrator = math.sqrt(max(floor**2 - of_noise**2, 0.0))
+        rest = math.sqrt(max(after**2 - floor**2, 0.0))
+        share = rest / min(before, 1.0) if before > 0 else 0.0
+        share = 1.0 if integrator > TOO_COARSE else share
+        known = (before, after, floor, share, per_signal, timestep, integrator, horizon)
+        return cls(metric, "1", *known, above_floor)
+
+    @property
+    def is_too_coarse(self) -> bool:
+        """Whether the integrator's error would hide any other, so that nothing can be judged."""
+        return self.integrator > TOO_COARSE
+
+    @property
+    def integrator_exceeds_noise(self) -> bool:
+        """Whether the integrator's error is above noise's, so that it hides what noise does not."""
+        return self.integrator > self.noise_floor / math.sqrt(2.0)
+
+    @property
+    def is_near_floor(self) -> bool:
+        """Whether what is left is what noise, and an integrator that can be trusted, make."""
+        return self.after <= ABOVE_FLOOR * self.noise_floor and not self.is_too_coarse
+
+    @property
+    def is_adequate(self) -> bool:
+        """Whether no signal's error is well above its noise floor, and this can be judged."""
+        return not self.above_floor and not self.is_too_coarse
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether what is left is hardly any of the error, or little and near the noise floor.
+
+        Where nothing was added (`before` is `after`), whether the model is adequate.
+        """
+        if self.before == self.after:
+            return self.is_adequate
+        share = self.unexplained_share
+        return share <= SMALLEST_SHARE or (self.is_near_floor and share <= UNEXPLAINED)
+
+    @property
+    def coarseness(self) -> str:
+        """That nothing can be judged, in one sentence."""
+        return (
+            f"The model cannot be judged at a timestep of {self.timestep:g} s: the integrator's "
+            f"error alone is {100 * self.integrator:.0f} % of the signals' spread. Give it a "
+            "smaller timestep, an implicit integrator or softer gains."
+        )
 
 
 class Metric(NamedTuple):

@@ -13,6 +13,7 @@ from garat_jax.diagnosis.diagnose import split
 from garat_jax.diagnosis.figures import label
 from garat_jax.diagnosis.localise import BY_CONTACTS, Place
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.metric import Errors
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.report_data import (
     conditions_section,
@@ -32,7 +33,7 @@ from garat_jax.diagnosis.report_effects import (
     parameters_section,
     ranking_section,
 )
-from garat_jax.diagnosis.results import Diagnosis, Errors
+from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.diagnosis.view import View, look
 from garat_jax.report import Fact, Figure, Reproduce, Section, Table
 from garat_jax.runs import RunDirectory
@@ -129,7 +130,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
 def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     """Return the numbers of a diagnosis to be seen first."""
     error, over = diagnosis.decisive, diagnosis.over
-    rest = Fact(_percent(error.unexplained_share), "of the error stays unexplained")
+    left = "that the delay alone leaves stays" if diagnosis.gap is diagnosis.on_time else "stays"
+    rest = Fact(_percent(diagnosis.gap.unexplained_share), f"of the error {left} unexplained")
     if num := len(error.above_floor if diagnosis.but else diagnosis.loud):
         rest = Fact(str(num), f"{'signal stays' if num == 1 else 'signals stay'} above the noise")
     after = Fact(_percent(error.after), f"error{over} with the effects that were found")

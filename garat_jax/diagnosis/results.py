@@ -18,9 +18,9 @@ from garat_jax.diagnosis.findings import (
     Unseen,
     list_unseen,
 )
-from garat_jax.diagnosis.judge import NIL, NO_CERTAIN_LEAD, SMALLEST_SHARE, TOO_FEW
+from garat_jax.diagnosis.judge import NIL, NO_CERTAIN_LEAD, TOO_FEW
 from garat_jax.diagnosis.localise import Place
-from garat_jax.diagnosis.metric import ABOVE_FLOOR
+from garat_jax.diagnosis.metric import Errors
 from garat_jax.errors import choose
 from garat_jax.plain import finite_or_null, to_plain
 
@@ -32,11 +32,6 @@ OFFER = (
 """What is said where the verdict is `unexplained`."""
 MOST_LISTED = 6
 """Candidates that are printed, the first; so is what passes, wherever it stands."""
-TOO_COARSE = 1.0 / ABOVE_FLOOR
-"""Integrator's error, relative to the signals' spread, above which a model that is as bad as always
-predicting the mean would be near the floor."""
-UNEXPLAINED = 0.3
-"""Share of the error that may stay, however near to the noise floor that is."""
 Verdict = Literal["adequate", "missing_effect", "unexplained"]
 
 
@@ -47,98 +42,6 @@ class Rung:
     added: Candidate | None
     error_fit: float
     error_holdout: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Errors:
-    """Held-out prediction error.
-
-    Attributes:
-        metric: How it is measured, the horizon among it.
-        unit: "1": relative to each signal's standard deviation; see `segments.metric_spread`.
-        before: Of the model as it is.
-        after: With every selected effect.
-        noise_floor: What noise and the integrator's own error make.
-        unexplained_share: What is left above the floor, over `before`; 1 if that is too coarse.
-        per_signal: By signal: before, after, noise_floor and the signal's unit, in that unit.
-        timestep: Seconds of a step of the physics.
-        integrator: What the integrator's error alone makes at this timestep.
-        horizon: Seconds of the segments that are predicted.
-        above_floor: The signals whose error stays well above their noise floor.
-    """
-
-    metric: str
-    unit: str
-    before: float
-    after: float
-    noise_floor: float
-    unexplained_share: float
-    per_signal: Mapping[str, Mapping[str, float | str]]
-    timestep: float = math.nan
-    integrator: float = 0.0
-    horizon: float = math.nan
-    above_floor: tuple[str, ...] = ()
-
-    @classmethod
-    def above(
-        cls,
-        floor: float,
-        of_noise: float,
-        *,
-        metric: str,
-        horizon: float,
-        before: float,
-        after: float,
-        timestep: float,
-        per_signal: Mapping[str, Mapping[str, float | str]],
-        above_floor: tuple[str, ...] = (),
-    ) -> "Errors":
-        """Hold errors against their floor, of which noise alone makes `of_noise`.
-
-        A model may err more than predicting the mean would, 1; what is left is then held against
-        that.
-        """
-        integrator = math.sqrt(max(floor**2 - of_noise**2, 0.0))
-        rest = math.sqrt(max(after**2 - floor**2, 0.0))
-        share = rest / min(before, 1.0) if before > 0 else 0.0
-        share = 1.0 if integrator > TOO_COARSE else share
-        known = (before, after, floor, share, per_signal, timestep, integrator, horizon)
-        return cls(metric, "1", *known, above_floor)
-
-    @property
-    def is_too_coarse(self) -> bool:
-        """Whether the integrator's error would hide any other, so that nothing can be judged."""
-        return self.integrator > TOO_COARSE
-
-    @property
-    def integrator_exceeds_noise(self) -> bool:
-        """Whether the integrator's error is above noise's, so that it hides what noise does not."""
-        return self.integrator > self.noise_floor / math.sqrt(2.0)
-
-    @property
-    def is_near_floor(self) -> bool:
-        """Whether what is left is what noise, and an integrator that can be trusted, make."""
-        return self.after <= ABOVE_FLOOR * self.noise_floor and not self.is_too_coarse
-
-    @property
-    def is_adequate(self) -> bool:
-        """Whether no signal's error is well above its noise floor, and this can be judged."""
-        return not self.above_floor and not self.is_too_coarse
-
-    @property
-    def is_explained(self) -> bool:
-        """Whether what is left is hardly any of the error, or little and near the noise floor."""
-        share = self.unexplained_share
-        return share <= SMALLEST_SHARE or (self.is_near_floor and share <= UNEXPLAINED)
-
-    @property
-    def coarseness(self) -> str:
-        """That nothing can be judged, in one sentence."""
-        return (
-            f"The model cannot be judged at a timestep of {self.timestep:g} s: the integrator's "
-            f"error alone is {100 * self.integrator:.0f} % of the signals' spread. Give it a "
-            "smaller timestep, an implicit integrator or softer gains."
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +56,8 @@ class Diagnosis:
     `longest` holds the errors over longer segments than those that were fitted, the longest within
     which small changes do not grow; None where those fitted are as long. `finer` holds those at a
     finer timestep, where the integrator's error hides much at the model's own; None elsewhere, and
-    where nothing was found that could explain the errors.
+    where nothing was found that could explain the errors. `on_time` holds those of `error` with the
+    delays that were found in the model from the start, or of `finer`; None where none was found.
 
     `own` names the effects that the model has and that may have another size: one of them that was
     selected takes the place of the model's.
@@ -180,6 +84,7 @@ class Diagnosis:
     conditions: Mapping[str, "Diagnosis"] = dataclasses.field(default_factory=dict)
     longest: Errors | None = None
     finer: Errors | None = None
+    on_time: Errors | None = None
     own: tuple[Named, ...] = ()
 
     def added(self, rung: Rung) -> str:
@@ -272,9 +177,11 @@ class Diagnosis:
     def rest(self) -> str:
         """What stays unexplained, as a clause."""
         if self.loud:
-            return f"that of {', '.join(self.loud)}{self.over} stays well above its noise floor"
-        share = 100 * self.decisive.unexplained_share
-        return f"{share:.0f} % of the error{self.over} stays unexplained"
+            over = self._over(self.gap)
+            return f"that of {', '.join(self.loud)}{over} stays well above its noise floor"
+        share = 100 * self.gap.unexplained_share
+        which = " that the delay alone leaves" if self.gap is self.on_time else ""
+        return f"{share:.0f} % of the error{self._over(self.gap)}{which} stays unexplained"
 
     @property
     def but(self) -> str:
@@ -299,7 +206,16 @@ class Diagnosis:
     def loud(self) -> tuple[str, ...]:
         """The signals well above their noise floor, where only these tell of a gap."""
         alone = not self.selected and self.decisive.is_near_floor
-        return self.decisive.above_floor if alone else ()
+        of_delays = self.gap is self.on_time and all(c.is_delay for c in self.selected)
+        return self.gap.above_floor if alone or of_delays else ()
+
+    @property
+    def gap(self) -> Errors:
+        """The errors of which much is left: those on time where, beside a delay, that is little."""
+        measured = [e for e in (self.error, self.finer, self.longest) if e is not None]
+        if self.verdict == "unexplained" and self.on_time and all(map(self._is_right, measured)):
+            return self.on_time
+        return self.decisive
 
     @property
     def decisive(self) -> Errors:
@@ -324,9 +240,14 @@ class Diagnosis:
     @property
     def over(self) -> str:
         """Over how long segments the decisive errors are, in words; empty if that is not known."""
-        error = self.decisive
-        at = f" at a timestep of {error.timestep:.2g} s" if error is self.finer else ""
+        return self._over(self.decisive)
+
+    def _over(self, error: Errors) -> str:
+        at = f" at a timestep of {error.timestep:.2g} s" if self._is_finer(error) else ""
         return f" over {error.horizon:.2g} s{at}" if math.isfinite(error.horizon) else ""
+
+    def _is_finer(self, error: Errors) -> bool:
+        return self.finer is not None and error.timestep == self.finer.timestep
 
     def farther(self, spell: Callable[[float], str] = "{:.3g}".format) -> str:
         """Return a clause with the errors over longer segments, where they were measured."""
@@ -341,10 +262,15 @@ class Diagnosis:
         return self.verdict == "unexplained" and not self.decisive.is_too_coarse
 
     @property
+    def is_gap_finer(self) -> bool:
+        """Whether much is left at a finer timestep alone."""
+        return self._is_finer(self.gap)
+
+    @property
     def left_lines(self) -> list[str]:
         """What the gap that stays goes with, in words; nothing if none stays."""
-        if self.is_left and self.finer is not None and self.decisive is self.finer:
-            timestep = f"{self.finer.timestep:.2g} s"
+        if self.is_left and self.is_gap_finer:
+            timestep = f"{self.gap.timestep:.2g} s"
             return [f"it shows at a timestep of {timestep}: a model that has it may tell more"]
         lines = [place.evidence for place in self.left[:3]]
         nothing = ["the torque that is still missing follows no simple pattern"]

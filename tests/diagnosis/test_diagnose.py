@@ -16,8 +16,8 @@ from garat_jax.diagnosis.diagnose import verdict_of
 from garat_jax.diagnosis.held_out import HeldOut
 from garat_jax.diagnosis.hidden import DRAWN, OUTSIDE, make_recordings
 from garat_jax.diagnosis.judge import NIL
+from garat_jax.diagnosis.metric import Errors
 from garat_jax.diagnosis.report import diagnosis_lead
-from garat_jax.diagnosis.results import Errors
 from garat_jax.errors import UserError
 from garat_jax.runs import RunDirectory
 
@@ -158,6 +158,8 @@ FOUND = (SimpleNamespace(effect="coulomb_friction"),)
         (False, FOUND, (EXPLAINED, LEFT), "unexplained"),
         (False, FOUND, (LEFT, EXPLAINED), "unexplained"),
         (False, FOUND, (EXPLAINED, None, LEFT), "unexplained"),
+        (False, FOUND, (EXPLAINED, None, None, LEFT), "unexplained"),
+        (False, FOUND, (EXPLAINED, None, None, EXPLAINED), "missing_effect"),
     ],
 )
 def test_longest_segments_and_a_finer_timestep_have_a_say_in_the_verdict(

@@ -12,6 +12,7 @@ from garat_jax.diagnosis.hidden import make_recordings
 from garat_jax.diagnosis.judge import NO_CERTAIN_LEAD
 from garat_jax.diagnosis.leftover import leftover
 from garat_jax.diagnosis.localise import BY_CONTACTS, Place
+from garat_jax.diagnosis.metric import Errors
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.report import (
     diagnosis_facts,
@@ -20,7 +21,7 @@ from garat_jax.diagnosis.report import (
     write_diagnosis,
 )
 from garat_jax.diagnosis.report_data import warnings_section
-from garat_jax.diagnosis.results import Errors, Rung
+from garat_jax.diagnosis.results import Rung
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle
@@ -139,6 +140,27 @@ def test_a_gap_that_only_a_finer_timestep_shows_is_said_with_it():
     )
     missing = dataclasses.replace(MISSING, finer=finer)
     assert missing.decisive is missing.error
+
+
+def test_a_gap_that_only_what_a_delay_leaves_shows_is_said_with_it():
+    late = dataclasses.replace(FRICTION, effect="actuator_delay", target="all")
+    on_time = dataclasses.replace(MISSING.error, before=0.015, unexplained_share=0.4)
+    both = dataclasses.replace(
+        MISSING, verdict="unexplained", selected=(late, FRICTION), on_time=on_time
+    )
+    assert both.decisive is both.error
+    rest = "40 % of the error that the delay alone leaves stays unexplained."
+    assert both.sentence.endswith(f"0.2 → 0.011, noise floor 0.01; but {rest}")
+    assert diagnosis_lead(both).endswith(f": {rest}")
+    fact = diagnosis_facts(both)[-1]
+    assert (fact.value, fact.label) == (
+        "40 %",
+        "of the error that the delay alone leaves stays unexplained",
+    )
+    error = dataclasses.replace(MISSING.error, above_floor=("qvel.hinge",))
+    alone = dataclasses.replace(both, selected=(late,), error=error, on_time=error)
+    assert alone.sentence.endswith("; but that of qvel.hinge stays well above its noise floor.")
+    assert diagnosis_facts(alone)[-1].label == "signal stays above the noise"
 
 
 def test_long_segments_that_show_no_gap_do_not_decide():

@@ -10,10 +10,10 @@ from garat_jax.diagnosis.diagnose import diagnose, warn_of_rest
 from garat_jax.diagnosis.held_out import longest_errors
 from garat_jax.diagnosis.horizon import choose_horizon, cut_longer, cut_longest
 from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.metric import Errors
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.report import diagnosis_lead
-from garat_jax.diagnosis.results import Errors
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import settle

@@ -311,7 +311,7 @@ def test_what_impacts_hide_at_the_models_timestep_shows_at_a_finer_one(seed):
         problem, settled = settled_ball(seed, push)
         floor = noise_floor(problem, make_metric(problem), settled)
         error = errors_of(problem, (settled, settled), floor, "held out")
-        finer = finer_errors(problem, settled, "held out")
+        finer, _ = finer_errors(problem, settled, "held out")
         assert error.integrator_exceeds_noise and error.is_near_floor
         assert finer and not finer.integrator_exceeds_noise
         assert finer.is_near_floor is not is_seen
@@ -339,7 +339,7 @@ def test_what_was_found_is_measured_at_a_finer_timestep_too(monkeypatch, push, e
 
 def test_a_finer_timestep_tells_nothing_of_a_model_as_it_is_or_where_noise_hides_more(monkeypatch):
     monkeypatch.setattr("garat_jax.diagnosis.held_out.longest_errors", lambda *_: None)
-    monkeypatch.setattr("garat_jax.diagnosis.held_out.finer_errors", lambda *_: "measured")
+    monkeypatch.setattr("garat_jax.diagnosis.held_out.finer_errors", lambda *_: ("measured", None))
     problem, settled = settled_ball(0, candidates=[MotorGain("actuator/lift")])
     floor = noise_floor(problem, make_metric(problem), settled)
 
@@ -359,5 +359,5 @@ def test_a_finer_timestep_tells_nothing_of_a_model_as_it_is_or_where_noise_hides
 
 def test_an_engine_that_errs_as_much_at_a_finer_timestep_tells_nothing_there(monkeypatch):
     problem, settled = settled_ball(0)
-    monkeypatch.setattr("garat_jax.diagnosis.results.TOO_COARSE", 1e-6)
-    assert finer_errors(problem, settled, "held out") is None
+    monkeypatch.setattr("garat_jax.diagnosis.metric.TOO_COARSE", 1e-6)
+    assert finer_errors(problem, settled, "held out") == (None, None)
