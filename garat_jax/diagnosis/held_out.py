@@ -51,6 +51,11 @@ class HeldOut(NamedTuple):
         """Whether what was found explains the errors, all that were measured."""
         return all(errors is None or errors.is_explained for errors in self)
 
+    @property
+    def are_explained_at_finer(self) -> bool:
+        """Whether it explains those at a finer timestep, if they were measured."""
+        return self.finer is None or HeldOut(self.finer, on_time=self.on_time).are_explained
+
 
 def measure_held_out(
     problem: Problem,

@@ -163,8 +163,8 @@ def _as_one(model: Model, recordings, holdout, rounds: list[Diagnosis], added) -
     ladder, measured, drifts = _ladder(model, recordings, holdout, added)
     if drifts and len(added) == len(first.selected):  # its diagnosis tested what is as good, too
         drifts = first.drifts or drifts
-    hidden = measured.finer is not None and not measured.finer.is_explained
-    stays = hidden or (last.verdict == "unexplained" and not measured.are_explained)
+    stays = last.verdict == "unexplained" and not measured.are_explained
+    stays |= not measured.are_explained_at_finer
     verdict: Verdict = "unexplained" if stays else "missing_effect"
     return dataclasses.replace(
         first,

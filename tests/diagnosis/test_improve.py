@@ -102,6 +102,19 @@ def test_a_gap_that_a_finer_timestep_shows_is_left_by_a_model_that_is_adequate(
     assert "adequate at its own timestep; at a finer one a gap stays." in section.text
 
 
+def test_so_is_one_that_a_finer_timestep_shows_of_what_a_delay_leaves(improved, monkeypatch):
+    done = improved[2]
+    first, last = done.rounds
+    right = dataclasses.replace(last.error, after=0.1, unexplained_share=0.01, timestep=0.0005)
+    gap = dataclasses.replace(right, unexplained_share=0.5)
+    measured = ((), HeldOut(done.diagnosis.error, None, right, gap), ())
+    monkeypatch.setattr("garat_jax.diagnosis.improve._ladder", lambda *given: measured)
+    whole = _as_one(done.model, (), (), [first, last], first.selected)
+    assert (whole.verdict, whole.gap) == ("unexplained", gap)
+    (line,) = whole.left_lines
+    assert line.startswith("it shows at a timestep of 0.0005 s")
+
+
 def test_a_drift_that_the_later_rounds_explain_is_not_said(improved, monkeypatch):
     """What drifts is found beside all effects that were added, not beside those of one round."""
     monkeypatch.setattr("garat_jax.diagnosis.improve.is_above", lambda *_: True)
