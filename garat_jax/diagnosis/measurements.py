@@ -55,6 +55,7 @@ class Recording:
         velocity_measured: Whether `qvel` was measured.
         spans: Index ranges [start, stop) without gaps.
         warnings: What is odd but usable, one line each.
+        quaternions: The first column of each quaternion in `qpos`.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Recording:
     velocity_measured: bool
     spans: tuple[tuple[int, int], ...]
     warnings: tuple[str, ...]
+    quaternions: tuple[int, ...] = ()
 
     @property
     def interval(self) -> float:
@@ -133,6 +135,7 @@ class Recording:
             velocity_measured=velocity_measured,
             spans=spans,
             warnings=(),
+            quaternions=tuple(quaternions(model)),
         )
         return dataclasses.replace(
             recording, warnings=(*warnings, *oddities(recording, model, wrapped))
@@ -179,11 +182,18 @@ def longest_span(recordings: Sequence[Recording]) -> float:
 
 
 def noise(recording: Recording) -> np.ndarray:
-    """Estimate the standard deviation of each signal's noise, [nq + nv]; see `white_noise`."""
+    """Estimate the standard deviation of each signal's noise, [nq + nv]; see `white_noise`.
+
+    The four parts of a quaternion have that of the noisiest: its length is 1, so that the noise of
+    w is of second order near a turn of 0, and grows with the turn.
+    """
     state = np.concatenate([recording.qpos, recording.qvel], axis=1)
     parts = [white_noise(recording.time[a:b], state[a:b]) for a, b in recording.spans]
     lengths = [b - a for a, b in recording.spans]
-    return np.sqrt(np.average(np.square(parts), axis=0, weights=lengths))
+    sizes = np.sqrt(np.average(np.square(parts), axis=0, weights=lengths))
+    for first in recording.quaternions:
+        sizes[first : first + 4] = sizes[first : first + 4].max()
+    return sizes
 
 
 def _check_columns(table: Table, model: mujoco.MjModel) -> bool:

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from garat_jax.diagnosis.columns import signals
-from garat_jax.diagnosis.measurements import Recording
+from garat_jax.diagnosis.measurements import Recording, noise
 from tests import models
 from tests.diagnosis.test_measurements import TUMBLER, columns, save, tumbling
 
@@ -23,6 +23,22 @@ def test_quaternions_of_either_sign_are_read_alike(tmp_path):
     )
     np.testing.assert_array_equal(other.qpos, plain.qpos)
     np.testing.assert_array_equal(other.qvel, plain.qvel)
+
+
+def test_the_parts_of_a_quaternion_have_one_noise(tmp_path):
+    time, qpos, _ = tumbling()
+    rng, first = np.random.default_rng(0), (3, 7)
+    for start in first:  # level but for noise, of which w shows next to nothing
+        qpos[:, start : start + 4] = [1.0, 0.0, 0.0, 0.0] + 1e-3 * rng.normal(size=(len(time), 4))
+    names = [s.name for s in signals(TUMBLER)][: TUMBLER.nq]
+    file = save(tmp_path, {"time": time, **dict(zip(names, qpos.T, strict=True))})
+    recording = Recording.read(file, TUMBLER)
+    assert recording.quaternions == first
+    assert recording.qpos[:, 3].std() < 1e-5
+    for start in first:
+        sizes = noise(recording)[start : start + 4]
+        np.testing.assert_allclose(sizes, 1e-3, rtol=0.3)
+        assert len({*sizes}) == 1
 
 
 def turning(wrapped: bool):
