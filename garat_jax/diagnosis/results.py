@@ -21,6 +21,7 @@ from garat_jax.diagnosis.findings import (
 from garat_jax.diagnosis.judge import NIL, NO_CERTAIN_LEAD, TOO_FEW
 from garat_jax.diagnosis.localise import Place
 from garat_jax.diagnosis.metric import Errors
+from garat_jax.effects import CATALOGUE
 from garat_jax.errors import choose
 from garat_jax.plain import finite_or_null, to_plain
 
@@ -94,8 +95,11 @@ class Diagnosis:
         return f"+ {self.spelled(rung.added.named)} ({rung.added.sizes})"
 
     def spelled(self, named: Named, spell: Callable[[Named], str] = str) -> str:
-        """Spell an effect; of one that the model has, another size was found."""
-        return f"another size of {spell(named)}" if named in self.own else spell(named)
+        """Spell an effect; of one that the model has, that another size, or none, was found."""
+        if named not in self.own:
+            return spell(named)
+        none = " (none)" if any(c.named == named and _is_none(c) for c in self.selected) else ""
+        return f"another size{none} of {spell(named)}"
 
     def under(self, condition: str) -> tuple[Candidate, ...]:
         """Return all effects under a condition: the shared ones, some replaced, and its own."""
@@ -321,3 +325,10 @@ class Diagnosis:
                 instead = " (instead of the shared one)" if c.named in shared else ""
                 lines.append(f"  {c.named}{instead}: {c.sizes}")
         return lines
+
+
+def _is_none(candidate: Candidate) -> bool:
+    """Say whether an effect of the catalogue was found to have no size."""
+    law = CATALOGUE.get(candidate.effect)
+    nominal = {p.name: p.nominal for p in law.parameters()} if law else {}
+    return all(e.estimate == nominal.get(name) for name, e in candidate.parameters.items())

@@ -56,6 +56,17 @@ def test_it_is_found_and_takes_the_place_of_the_models(size):
     assert diagnosis_lead(found).startswith(said)
 
 
+def test_one_that_is_not_there_is_said_to_be_none():
+    found = diagnose(DAMPED, recordings(0.0))
+    (damping,) = found.selected
+    assert damping.parameters["coefficient"].estimate == 0.0
+    spelled = "another size (none) of viscous_damping at joint/hinge"
+    assert found.sentence.startswith(f"Missing: {spelled}; held-out")
+    assert f"  + {spelled} (coefficient 0 " in str(found)
+    (effect,) = [e for e in repaired(DAMPED, found.selected).effects if e.kind in FEW]
+    assert effect.coefficient == 0.0
+
+
 def test_of_the_right_size_it_is_left_alone():
     found = diagnose(DAMPED, recordings(0.02))
     assert (found.verdict, found.selected) == ("adequate", ())
