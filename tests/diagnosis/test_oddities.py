@@ -45,6 +45,7 @@ def written(recording: Recording, time=1.0, position=1.0, speed=1.0) -> Recordin
 @pytest.mark.parametrize(
     ("time", "position", "speed", "said"),
     [
+        (1 / 60, 1, 1, ["the samples are 6.667e-05 s apart; is time in min?"]),
         (1e3, 1, 1, ["the samples are 4 s apart; is time in ms?"]),
         (1e6, 1, 1, ["the samples are 4000 s apart; is time in us?"]),
         (1, 1, 1 / DEGREE, ["times the derivative of qpos.hinge; is qvel.hinge in deg/s?"]),
