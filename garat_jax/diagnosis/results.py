@@ -209,15 +209,18 @@ class Diagnosis:
     @property
     def loud(self) -> tuple[str, ...]:
         """The signals well above their noise floor, where only these tell of a gap."""
-        alone = not self.selected and self.decisive.is_near_floor
         of_delays = self.gap is self.on_time and all(c.is_delay for c in self.selected)
-        return self.gap.above_floor if alone or of_delays else ()
+        alone = not self.selected or of_delays
+        return self.gap.above_floor if alone and self.gap.is_near_floor else ()
 
     @property
     def gap(self) -> Errors:
-        """The errors of which much is left: those on time where, beside a delay, that is little."""
-        measured = [e for e in (self.error, self.finer, self.longest) if e is not None]
-        if self.verdict == "unexplained" and self.on_time and all(map(self._is_right, measured)):
+        """The errors of which much is left: those on time where these show it, too.
+
+        Beside what a delay makes even much may be little.
+        """
+        is_told = self.verdict == "unexplained" and self.decisive is self.error
+        if is_told and self.on_time and not self.on_time.is_explained:
             return self.on_time
         return self.decisive
 

@@ -158,9 +158,15 @@ def test_a_gap_that_only_what_a_delay_leaves_shows_is_said_with_it():
         "of the error that the delay alone leaves stays unexplained",
     )
     error = dataclasses.replace(MISSING.error, above_floor=("qvel.hinge",))
-    alone = dataclasses.replace(both, selected=(late,), error=error, on_time=error)
+    near = dataclasses.replace(error, before=error.after, unexplained_share=0.4)
+    alone = dataclasses.replace(both, selected=(late,), error=error, on_time=near)
     assert alone.sentence.endswith("; but that of qvel.hinge stays well above its noise floor.")
     assert diagnosis_facts(alone)[-1].label == "signal stays above the noise"
+    far = dataclasses.replace(near, before=0.02, after=0.02, unexplained_share=0.9)
+    much = dataclasses.replace(alone, error=dataclasses.replace(error, after=0.02), on_time=far)
+    assert much.sentence.endswith(
+        "90 % of the error that the delay alone leaves stays unexplained."
+    )
 
 
 def test_long_segments_that_show_no_gap_do_not_decide():
