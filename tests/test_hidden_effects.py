@@ -310,7 +310,7 @@ def scored(truth, *selected, verdict="missing_effect"):
         verdict=verdict,
         selected=selected,
         candidates=selected,
-        decisive=SimpleNamespace(unexplained_share=0.0),
+        gap=SimpleNamespace(unexplained_share=0.0),
         seconds=1.0,
     )
     return score(found, truth, SCENES["arm2"].model)

@@ -341,6 +341,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "profiling_clock": profiling_clock,
     "hidden_effects": functools.partial(hidden_effects, 12),
     "hidden_effects_15": functools.partial(hidden_effects, 15),
+    "hidden_effects_outside": functools.partial(hidden_effects, 16, "outside"),
     "hidden_effects_pairs": functools.partial(hidden_effects, 14, "pair"),
     "hidden_effects_others": functools.partial(hidden_effects_others, (11, 10, 9, 8, 7, 6, 5, 4)),
     "timing": timing,

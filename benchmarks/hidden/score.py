@@ -99,7 +99,7 @@ def score(found: Diagnosis, truth: Truth, model: mujoco.MjModel) -> dict[str, An
         "claimed": [[str(n) for n in names(c)] for c in found.selected],
         "first": [str(n) for n in names(first)] if first else [],
         "first_fails": "" if first is None or first.passes else first.why,
-        "unexplained_share": found.decisive.unexplained_share,
+        "unexplained_share": found.gap.unexplained_share,
         "seconds": found.seconds,
     }
     category = truth.case.category
