@@ -1,25 +1,92 @@
-"""Which candidates do what a contender does, as screened or at the size at which it was fitted.
+"""Which candidates do what the best contender does, as screened or at the size that it has.
 
 Screening holds candidates against each other at sizes of its own. Where what an effect does changes
-with its size and sign, as beside contacts, two that are the same force may look unlike there.
+with its size and sign, as beside contacts, two that are the same force may look unlike there, and
+what one of them does may not show at all.
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.differences import cosines
+from garat_jax.diagnosis.contend import Contender, best_of, fit_one, likely_ones, set_aside
+from garat_jax.diagnosis.differences import cosines, is_erratic
+from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem
-from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, gather
+from garat_jax.diagnosis.screen import EQUIVALENT, Score, cosine, gather, simpler_law
 from garat_jax.diagnosis.starts import Fit
+from garat_jax.diagnosis.trials import UNEVEN
+
+MATCHED = 2
+"""How often a size is sought, at most, at which a candidate changes as much as a contender."""
+AS_MUCH = 0.1
+"""Difference of two norms, relative to the one, up to which two change as much."""
+
+
+def with_alike(
+    problem: Problem,
+    current: Fit,
+    scores: Sequence[Score],
+    contenders: Sequence[Contender],
+    say: Callable[[str], None],
+    in_contact: bool = False,
+) -> list[Contender]:
+    """Add fits of the candidates that do what the best contender does: each may be meant.
+
+    They begin in its place, where it ended. In contact a fit from elsewhere may not come near,
+    its initial states on the other side of many a contact; so one that was fitted is fitted again.
+
+    Args:
+        problem: What is fitted.
+        current: The fit of the effects selected so far.
+        scores: What screening says, best first.
+        contenders: Those that were fitted.
+        say: Told what is being done.
+        in_contact: Look only at those of which few samples make what they change.
+    """
+    best = best_of(contenders)
+    if best is None:
+        return []
+    fitted = {contender.score.effect: contender for contender in contenders}
+    likely = {score.effect for score in likely_ones(problem, scores)}
+    like = [score for score in scores if score.effect == best.score.effect]
+    others: list[Score] = []
+    for score in scores:
+        is_new = score.effect in likely and score.effect not in fitted and not in_contact
+        is_law = score.effect in likely or not simpler_law(problem, score, scores)
+        is_name = score.effect == best.score.effect or bool(twins(score, [*like, *others]))
+        if not is_name and (is_new or (is_law and _is_uneven(problem, score))):
+            others.append(score)
+    rival = best.fit.cost[problem.fitted].sum()
+    as_screened, as_fitted = alike_as_fitted(problem, current, best.score, best.fit, others)
+    in_place = set_aside(problem, best.fit, [best.score.effect])
+    near = in_place if {*in_place.free} == {*current.free} else current
+    for score in as_screened:
+        if score.effect not in fitted:
+            fitted[score.effect] = fit_one(problem, current, score, rival, say)
+    for score in as_fitted:
+        old, again = fitted.get(score.effect), fit_one(problem, near, score, rival, say)
+        if not old or again.fit.cost.sum() < old.fit.cost.sum():
+            shared = old.fit.residual if old else None  # by its other names, which go with it
+            fitted = {e: c for e, c in fitted.items() if c.fit.residual is not shared}
+            fitted[score.effect] = again
+    return [*fitted.values()]
+
+
+def _is_uneven(problem: Problem, score: Score) -> bool:
+    """Say whether few samples make what a candidate changes, as in contact."""
+    is_tried = score.possible and not score.excluded
+    return is_tried and is_erratic(score.contribution, problem.num_signals, UNEVEN)
 
 
 def alike_as_fitted(
     problem: Problem, current: Fit, score: Score, fitted: Fit, others: Sequence[Score]
-) -> list[Score]:
+) -> tuple[list[Score], list[Score]]:
     """Return those of some candidates that do what a contender does.
 
-    A law that lists several sizes is no multiple of itself and is held against it as screened only.
+    They are held against it at the size at which they change as much. A law that lists several
+    sizes is no multiple of itself and is held against it as screened only.
 
     Args:
         problem: What is fitted.
@@ -27,18 +94,41 @@ def alike_as_fitted(
         score: What screening said of the contender.
         fitted: The contender's fit.
         others: What it said of the candidates.
+
+    Returns:
+        Those that do so as screened only, and those that do at the contender's size, with that.
     """
     alike = [other for other in others if cosine(score, other) > EQUIVALENT]
-    scaled = [s for s in others if s not in alike and problem.num_listed(s.effect) == 1]
+    scaled = [s for s in others if problem.num_listed(s.effect) == 1]
     if not scaled:
-        return alike
+        return alike, []
     _, evidence, weight = gather(problem, current)
+
+    def change(thetas: np.ndarray) -> np.ndarray:
+        return weight[:, None] * evidence.change(thetas)
+
     changed = [*{*fitted.free} ^ {*current.free}]  # a refined law comes in a simpler one's place
-    own = weight[:, None] * evidence.change(_moved(current, changed, fitted.theta[changed])[None])
-    times = [float(np.linalg.norm(own) / np.linalg.norm(s.contribution)) for s in scaled]
-    thetas = [_enlarged(problem, current, *each) for each in zip(scaled, times, strict=True)]
-    same = cosines(weight[:, None] * evidence.change(np.stack(thetas)), own) > EQUIVALENT
-    return alike + [other for other, is_same in zip(scaled, same, strict=True) if is_same]
+    own = change(_moved(current, changed, fitted.theta[changed])[None])
+    much, tried = np.linalg.norm(own), np.arange(len(scaled))
+    does = np.stack([s.contribution for s in scaled], axis=1)
+    times, thetas = np.ones(len(scaled)), np.tile(current.theta, (len(scaled), 1))
+    is_same = np.zeros(len(scaled), bool)
+    for _ in range(MATCHED):
+        times[tried] *= much / np.linalg.norm(does[:, tried], axis=0)
+        thetas[tried] = [_enlarged(problem, current, scaled[i], times[i]) for i in tried]
+        does[:, tried] = change(thetas[tried])
+        is_same = cosines(does, own) > EQUIVALENT
+        is_off = np.abs(np.linalg.norm(does, axis=0) - much) > AS_MUCH * much
+        tried = np.flatnonzero(is_off & ~is_same & does.any(axis=0))
+        if not len(tried):
+            break
+    same = [
+        dataclasses.replace(s, start={j: float(theta[j]) for j in s.start})
+        for s, theta, same in zip(scaled, thetas, is_same, strict=True)
+        if same
+    ]
+    matched = {score.effect for score in same}
+    return [score for score in alike if score.effect not in matched], same
 
 
 def _enlarged(problem: Problem, current: Fit, score: Score, times: float) -> np.ndarray:

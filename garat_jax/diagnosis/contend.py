@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.alike import alike_as_fitted
 from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.names import is_predicted, renamed, stands_for, twins
@@ -65,33 +64,26 @@ def fit_contenders(
         refinable: Indices of those of them in whose place a refinement may come.
         scores: What screening says, best first.
         say: Told what is being done.
-        num: How many, those like the first counted as one, besides those that are like the best.
+        num: How many, those like the first counted as one.
     """
     contenders = _fit_refined(problem, current, refinable, scores, say)
     done = {c.score.effect for c in contenders}
-    likely = [s for s in scores if s.possible and s.share > LIKELY and s.effect not in done]
-    likely = [s for s in likely if s.share > 0.25 * likely[0].share]
-    likely = [s for s in likely if not simpler_law(problem, s, likely)]
-    likely = [s for i, s in enumerate(likely) if not twins(s, likely[:i])]
+    likely = likely_ones(problem, [score for score in scores if score.effect not in done])
     for score in _first_of(likely, num):
         rival = min((c.fit.cost[problem.fitted].sum() for c in contenders), default=np.inf)
         hopeless = 1.0 - score.share > HOPELESS * rival / current.cost[problem.fitted].sum()
         alike = any(cosine(score, c.score) > EQUIVALENT for c in contenders)
         if not hopeless or alike or len(contenders) < 2:
             contenders.append(fit_one(problem, current, score, rival, say))
-    return contenders + _fit_alike(problem, current, likely, contenders, say)
+    return contenders
 
 
-def _fit_alike(problem: Problem, current: Fit, likely, contenders: Sequence[Contender], say):
-    """Fit those that are like the best contender and were not fitted yet: each may be meant."""
-    done = {c.score.effect for c in contenders}
-    best = best_of(contenders)
-    if best is None:
-        return []
-    others = [s for s in likely if s.effect not in done]
-    rival = best.fit.cost[problem.fitted].sum()
-    alike = alike_as_fitted(problem, current, best.score, best.fit, others)
-    return [fit_one(problem, current, score, rival, say) for score in alike]
+def likely_ones(problem: Problem, scores: Sequence[Score]) -> list[Score]:
+    """Return the candidates that are expected to explain a good part, of equals the first."""
+    likely = [score for score in scores if score.possible and score.share > LIKELY]
+    likely = [s for s in likely if s.share > 0.25 * likely[0].share]
+    likely = [s for s in likely if not simpler_law(problem, s, likely)]
+    return [s for i, s in enumerate(likely) if not twins(s, likely[:i])]
 
 
 def best_of(contenders: Sequence[Contender]) -> Contender | None:

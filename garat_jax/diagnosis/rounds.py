@@ -5,9 +5,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from garat_jax.diagnosis.alike import with_alike
 from garat_jax.diagnosis.contend import (
     CONTENDERS,
     Contender,
+    best_of,
     fit_contenders,
     fit_one,
     with_evidence,
@@ -55,13 +57,17 @@ def run_round(
     gap = is_above(problem, metric, current, floor, above)
     scores = screen(problem, current, held)
     contenders = fit_contenders(problem, current, refinable, scores, say, num) if gap else []
+    contenders = with_alike(problem, current, scores, contenders, say)
     pair = far_better_pair(problem, current, scores, contenders) if looks_ahead else None
     stronger = pair.stronger if pair else None
     if stronger and all(c.score.effect != stronger.effect for c in contenders):
         contenders = [*contenders, fit_one(problem, current, stronger, np.inf, say)]
     contenders = with_twins(problem, current, scores, contenders, say)  # each name may be refined
+    best = best_of(contenders)
     contenders = refine(problem, metric, current, scores, contenders, floor, say)
     contenders = fill_out(problem, metric, contenders, floor, say)
+    if best_of(contenders) is not best:
+        contenders = with_alike(problem, current, scores, contenders, say, in_contact=True)
     contenders = with_twins(problem, current, scores, contenders, say)
     num_tests = len([score for score in scores if not score.excluded])
     contenders = with_evidence(problem, current, contenders, num_tests)

@@ -11,7 +11,7 @@ from garat_jax.diagnosis.contend import fit_contenders, with_twins
 from garat_jax.diagnosis.model_card import Model
 from garat_jax.diagnosis.screen import Score, screen
 from garat_jax.diagnosis.starts import settle
-from garat_jax.effects import BackEmf, GravityScale, ViscousDamping
+from garat_jax.effects import BackEmf, ViscousDamping
 from tests import models
 from tests.diagnosis.test_fit import UNIFORM, make_problem, record
 
@@ -135,24 +135,3 @@ def test_of_many_that_are_like_the_first_none_takes_the_place_of_another():
     chosen = contend._first_of(likely, contend.CONTENDERS)
     assert [score.effect for score in chosen] == [0, 1, 2, 5, 3, 4, 6, 7]
     assert [score.effect for score in contend._first_of(likely, 2)] == [0, 1, 2, 5, 3, 4]
-
-
-def test_what_is_like_the_one_that_fits_best_is_fitted_wherever_it_was_placed(monkeypatch):
-    def scored(effect: int, share: float, *contribution: float) -> Score:
-        columns, start = (effect,), {effect: 1.0}
-        return Score(effect, columns, (1.0,), start, share, 0.0, True, np.asarray(contribution))
-
-    axes = np.eye(5)
-    scores = [scored(i, 0.9 - 0.1 * i, *axes[i]) for i in range(4)]
-    scores += [scored(4, 0.1, *axes[4]), scored(5, 0.3, *(axes[2] + 0.01 * axes[4]))]
-    left = {0: 0.8, 1: 0.7, 2: 0.5, 3: 0.6, 5: 0.5}
-    problem = make_problem([record(UNIFORM)], [GravityScale("world") for _ in scores])
-    current = settle(problem, problem.simulator.base, problem.segments.start)
-
-    def fit(problem, current, score, rival, say):
-        fitted = dataclasses.replace(current, residual=left[score.effect] * current.residual)
-        return contend.Contender(score, fitted)
-
-    monkeypatch.setattr(contend, "fit_one", fit)
-    fitted = fit_contenders(problem, current, (), scores, print)
-    assert [contender.score.effect for contender in fitted] == [0, 1, 2, 3, 5]
