@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis import alike, contend
+from benchmarks.hidden.generate import Surveys, draw, generate, list_cases
+from garat_jax.diagnosis import alike, contend, diagnose, load_model
 from garat_jax.diagnosis.alike import alike_as_fitted, with_alike
+from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.contend import Contender, fit_contenders
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
@@ -175,3 +177,17 @@ def test_the_other_names_of_a_fit_that_was_bettered_go_with_it(fits, monkeypatch
     monkeypatch.setattr(alike, "fit_one", lambda *given: Contender(given[2], better))
     every = with_alike(problem, current, scores, [best, old, name], print, in_contact=True)
     assert [(c.score.effect, c.fit is better) for c in every] == [(2, False), (1, True)]
+
+
+@pytest.mark.slow
+def test_gravity_is_not_taken_for_a_force_along_the_rail_of_a_leg_that_hops(tmp_path):
+    name = "gravity_scale-medium"
+    scenes = Surveys()
+    truth = draw(next(case for case in list_cases(15) if case.name == name), scenes)
+    *paths, last = generate(truth, scenes[truth.robot], tmp_path)
+    model = load_model(tmp_path / f"{truth.robot}.xml")
+    found = diagnose(model, read_recordings(model, paths), read_recordings(model, [last]))
+    (gravity,) = found.selected
+    assert gravity.effect == "gravity_scale"
+    scale = gravity.parameters["scale"]
+    assert scale.low < truth.secrets[0]["scale"] < scale.high
