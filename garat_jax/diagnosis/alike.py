@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from garat_jax.diagnosis.contend import Contender, best_of, fit_one, likely_ones, set_aside
+from garat_jax.diagnosis.contend import Contender, best_of, fit_one, likely_ones, refines, set_aside
 from garat_jax.diagnosis.differences import cosines, is_erratic
 from garat_jax.diagnosis.names import twins
 from garat_jax.diagnosis.problem import Problem
@@ -34,8 +34,9 @@ def with_alike(
 ) -> list[Contender]:
     """Add fits of the candidates that do what the best contender does: each may be meant.
 
-    They begin in its place, where it ended. In contact a fit from elsewhere may not come near,
-    its initial states on the other side of many a contact; so one that was fitted is fitted again.
+    Those that do so at its size begin in its place, where it ended. In contact a fit from elsewhere
+    may not come near, its initial states on the other side of many a contact; so one that was
+    fitted is fitted again. A law that refines one that was added is fitted in its place only.
 
     Args:
         problem: What is fitted.
@@ -49,12 +50,16 @@ def with_alike(
     if best is None:
         return []
     fitted = {contender.score.effect: contender for contender in contenders}
+    held = {problem.simulator.slots[j].effect for j in current.free}
+    finer = {s.effect for s in scores if any(refines(problem, s.effect, i) for i in held)}
+    scores = [s for s in scores if s.effect not in finer or s.effect not in fitted]
     likely = {score.effect for score in likely_ones(problem, scores)}
     like = [score for score in scores if score.effect == best.score.effect]
     others: list[Score] = []
     for score in scores:
         is_new = score.effect in likely and score.effect not in fitted and not in_contact
-        is_law = score.effect in likely or not simpler_law(problem, score, scores)
+        has_simpler = score.effect in finer or bool(simpler_law(problem, score, scores))
+        is_law = score.effect in likely or not has_simpler
         is_name = score.effect == best.score.effect or bool(twins(score, [*like, *others]))
         if not is_name and (is_new or (is_law and _is_uneven(problem, score))):
             others.append(score)
@@ -123,7 +128,7 @@ def alike_as_fitted(
         if not len(tried):
             break
     same = [
-        dataclasses.replace(s, start={j: float(theta[j]) for j in s.start})
+        dataclasses.replace(s, start={j: float(theta[j]) for j in s.columns})
         for s, theta, same in zip(scaled, thetas, is_same, strict=True)
         if same
     ]

@@ -96,6 +96,7 @@ class Improvement:
             "error",
             "longest",
             "finer",
+            "on_time",
             "ladder",
             "drifts",
             "warnings",
@@ -275,7 +276,7 @@ def _rounds_section(rounds: Sequence[Diagnosis]) -> Section:
             ", ".join(found.spelled(c.named) for c in found.selected) or "nothing",
             found.over.removeprefix(" over "),
             *(f"{100 * e:.3g}" for e in (error.before, error.after, error.noise_floor)),
-            round(100 * error.unexplained_share),
+            round(100 * found.gap.unexplained_share),
         )
         for number, (found, error) in enumerate(((r, r.decisive) for r in rounds), 1)
     ]
@@ -283,7 +284,7 @@ def _rounds_section(rounds: Sequence[Diagnosis]) -> Section:
         "Each diagnosis begins with what the ones before it added. A better model predicts for "
         "longer, so later ones may follow the recordings over longer segments: errors, of what is "
         "held out, compare along a row, not down a column. What is left is that of the error that "
-        "noise does not explain."
+        "noise does not explain; where a gap stays beside a delay, of what the delay leaves."
     )
     return Section("Diagnosis after diagnosis", text, tables=[Table(columns, rows)])
 

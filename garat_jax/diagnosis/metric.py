@@ -127,7 +127,7 @@ class Errors:
 
 
 class Metric(NamedTuple):
-    """The error that is reported: see `results.Errors`.
+    """The error that is reported: see `Errors`.
 
     Attributes:
         weight: Squared metric of one squared whitened residual, [N].

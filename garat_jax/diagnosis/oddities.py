@@ -1,7 +1,8 @@
 """What is odd about a recording but usable: columns, units and samples that cannot well be right.
 
 Three things tell a unit. Measured velocity must be the derivative of measured position, mechanisms
-are sampled faster than twice a second, and hardly ever ten thousand times, and a motion must be one
+are sampled faster than twice a second, and hardly ever more than ten thousand
+times, and a motion must be one
 that the model can nearly make.
 """
 
@@ -31,7 +32,7 @@ SLACK = 0.5
 """Radians by which a measured angle may leave the joint's range without a word."""
 SLOWEST = 0.5
 """Seconds between samples beyond which time is hardly in seconds."""
-FASTEST = 1e-4
+FASTEST = 9e-5
 """Seconds between samples below which time may well be in minutes."""
 CLOCKS = ("ms", "us", "ns")
 ALIKE = 0.9
@@ -120,7 +121,7 @@ def _clock(recording: "Recording", ratios: dict[int, float], model: mujoco.MjMod
             hinges = [signals(model)[model.nq + dof].unit == "rad/s" for dof in ratios]
             if any(hinges) or recording.interval > SLOWEST:  # a slide may be in mm/s instead
                 return unit
-    if recording.interval < FASTEST:
+    if recording.interval < FASTEST and not told:
         return "min"
     fitting = [u for u in ("s", *CLOCKS) if recording.interval * UNITS[u].factor <= SLOWEST]
     return fitting[0] if fitting else CLOCKS[-1]

@@ -130,8 +130,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
 def diagnosis_facts(diagnosis: Diagnosis) -> list[Fact]:
     """Return the numbers of a diagnosis to be seen first."""
     error, over = diagnosis.decisive, diagnosis.over
-    left = "that the delay alone leaves stays" if diagnosis.gap is diagnosis.on_time else "stays"
-    rest = Fact(_percent(diagnosis.gap.unexplained_share), f"of the error {left} unexplained")
+    left = f"of the error{diagnosis.beside_delays} stays unexplained"
+    rest = Fact(_percent(diagnosis.gap.unexplained_share), left)
     if num := len(error.above_floor if diagnosis.but else diagnosis.loud):
         rest = Fact(str(num), f"{'signal stays' if num == 1 else 'signals stay'} above the noise")
     after = Fact(_percent(error.after), f"error{over} with the effects that were found")

@@ -184,8 +184,16 @@ class Diagnosis:
             over = self._over(self.gap)
             return f"that of {', '.join(self.loud)}{over} stays well above its noise floor"
         share = 100 * self.gap.unexplained_share
-        which = " that the delay alone leaves" if self.gap is self.on_time else ""
-        return f"{share:.0f} % of the error{self._over(self.gap)}{which} stays unexplained"
+        over = self._over(self.gap)
+        return f"{share:.0f} % of the error{over}{self.beside_delays} stays unexplained"
+
+    @property
+    def beside_delays(self) -> str:
+        """Of which error much is left, where it is what delays leave, as a clause; else empty."""
+        if self.gap is not self.on_time:
+            return ""
+        num = sum(c.is_delay for c in self.selected)
+        return " that the delay alone leaves" if num == 1 else " that the delays alone leave"
 
     @property
     def but(self) -> str:
@@ -220,6 +228,7 @@ class Diagnosis:
         Beside what a delay makes even much may be little.
         """
         is_told = self.verdict == "unexplained" and self.decisive is self.error
+        is_told &= not self.error.is_too_coarse
         if is_told and self.on_time and not self.on_time.is_explained:
             return self.on_time
         return self.decisive
@@ -334,4 +343,5 @@ def _is_none(candidate: Candidate) -> bool:
     """Say whether an effect of the catalogue was found to have no size."""
     law = CATALOGUE.get(candidate.effect)
     nominal = {p.name: p.nominal for p in law.parameters()} if law else {}
-    return all(e.estimate == nominal.get(name) for name, e in candidate.parameters.items())
+    estimates = candidate.parameters.items()
+    return bool(estimates) and all(e.estimate == nominal.get(name) for name, e in estimates)

@@ -66,8 +66,10 @@ def run_round(
     best = best_of(contenders)
     contenders = refine(problem, metric, current, scores, contenders, floor, say)
     contenders = fill_out(problem, metric, contenders, floor, say)
-    if best_of(contenders) is not best:
+    if (filled := best_of(contenders)) is not best:
         contenders = with_alike(problem, current, scores, contenders, say, in_contact=True)
+        if best_of(contenders) is not filled:
+            contenders = fill_out(problem, metric, contenders, floor, say)
     contenders = with_twins(problem, current, scores, contenders, say)
     num_tests = len([score for score in scores if not score.excluded])
     contenders = with_evidence(problem, current, contenders, num_tests)

@@ -12,7 +12,14 @@ from garat_jax.diagnosis.compare import read_recordings
 from garat_jax.diagnosis.contend import Contender, fit_contenders
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
-from garat_jax.effects import GravityScale, JointStiffness, TorqueOffset, ViscousDamping
+from garat_jax.effects import (
+    AsymmetricFriction,
+    CoulombFriction,
+    GravityScale,
+    JointStiffness,
+    TorqueOffset,
+    ViscousDamping,
+)
 from tests.diagnosis.test_fit import UNIFORM, make_problem, record
 
 EFFECTS = [
@@ -45,7 +52,8 @@ class OfForce:
 
 def scored(effect: int, sizes: dict[int, float], contribution: np.ndarray) -> Score:
     columns, size = tuple(sizes), tuple(sizes.values())
-    return Score(effect, columns, size, sizes, 0.5, 0.0, True, np.asarray(contribution))
+    start = {columns[0]: size[0]}
+    return Score(effect, columns, size, start, 0.5, 0.0, True, np.asarray(contribution))
 
 
 UPWARD = scored(0, {OFFSET: 1.0}, UP)
@@ -165,6 +173,22 @@ def test_what_does_the_same_in_contact_begins_where_the_best_one_ended(fits, mon
         assert np.array_equal(began[effect].start, best.fit.start)
         assert began[effect].theta[2] == 0.0
         assert began[effect].free == ()
+
+
+def test_a_law_that_refines_one_that_was_added_is_not_fitted_beside_it(monkeypatch):
+    laws = [CoulombFriction("joint/hinge"), AsymmetricFriction("joint/hinge")]
+    problem = make_problem([record(UNIFORM)], [*laws, GravityScale("world")])
+    current = settle(problem, problem.simulator.base, problem.segments.start)
+    current = dataclasses.replace(current, free=(0,))
+    scores = [likely(2, 0.9, AXES[0]), dataclasses.replace(likely(1, 0.01, JUMP), columns=(1,))]
+    best, asked = Contender(scores[0], current), []
+    monkeypatch.setattr(alike, "set_aside", lambda *given: current)
+    monkeypatch.setattr(alike, "alike_as_fitted", lambda *g: (asked.extend(g[-1]) or [], []))
+    for free, num in (((0,), 0), ((), 1)):
+        asked.clear()
+        near = dataclasses.replace(current, free=free)
+        with_alike(problem, near, scores, [best], print)
+        assert len(asked) == num
 
 
 def test_the_other_names_of_a_fit_that_was_bettered_go_with_it(fits, monkeypatch):

@@ -162,6 +162,15 @@ def test_a_gap_that_only_what_a_delay_leaves_shows_is_said_with_it():
     alone = dataclasses.replace(both, selected=(late,), error=error, on_time=near)
     assert alone.sentence.endswith("; but that of qvel.hinge stays well above its noise floor.")
     assert diagnosis_facts(alone)[-1].label == "signal stays above the noise"
+    twice = dataclasses.replace(both, selected=(late, late))
+    assert twice.sentence.endswith(
+        "40 % of the error that the delays alone leave stays unexplained."
+    )
+    coarse = dataclasses.replace(error, integrator=0.9)
+    hidden = dataclasses.replace(
+        both, error=coarse, on_time=dataclasses.replace(near, integrator=0.9)
+    )
+    assert hidden.gap is hidden.error
     far = dataclasses.replace(near, before=0.02, after=0.02, unexplained_share=0.9)
     much = dataclasses.replace(alone, error=dataclasses.replace(error, after=0.02), on_time=far)
     assert much.sentence.endswith(

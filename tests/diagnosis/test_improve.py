@@ -111,6 +111,8 @@ def test_so_is_one_that_a_finer_timestep_shows_of_what_a_delay_leaves(improved, 
     monkeypatch.setattr("garat_jax.diagnosis.improve._ladder", lambda *given: measured)
     whole = _as_one(done.model, (), (), [first, last], first.selected)
     assert (whole.verdict, whole.gap) == ("unexplained", gap)
+    written = dataclasses.replace(done, diagnosis=whole).to_json()
+    assert written["on_time"]["unexplained_share"] == 0.5
     (line,) = whole.left_lines
     assert line.startswith("it shows at a timestep of 0.0005 s")
 
