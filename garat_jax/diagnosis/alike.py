@@ -6,7 +6,7 @@ what one of them does may not show at all.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
@@ -50,19 +50,7 @@ def with_alike(
     if best is None:
         return []
     fitted = {contender.score.effect: contender for contender in contenders}
-    held = {problem.simulator.slots[j].effect for j in current.free}
-    finer = {s.effect for s in scores if any(refines(problem, s.effect, i) for i in held)}
-    scores = [s for s in scores if s.effect not in finer or s.effect not in fitted]
-    likely = {score.effect for score in likely_ones(problem, scores)}
-    like = [score for score in scores if score.effect == best.score.effect]
-    others: list[Score] = []
-    for score in scores:
-        is_new = score.effect in likely and score.effect not in fitted and not in_contact
-        has_simpler = score.effect in finer or bool(simpler_law(problem, score, scores))
-        is_law = score.effect in likely or not has_simpler
-        is_name = score.effect == best.score.effect or bool(twins(score, [*like, *others]))
-        if not is_name and (is_new or (is_law and _is_uneven(problem, score))):
-            others.append(score)
+    others = _others(problem, current, scores, best.score, fitted, in_contact)
     rival = best.fit.cost[problem.fitted].sum()
     as_screened, as_fitted = alike_as_fitted(problem, current, best.score, best.fit, others)
     in_place = set_aside(problem, best.fit, [best.score.effect])
@@ -77,6 +65,34 @@ def with_alike(
             fitted = {e: c for e, c in fitted.items() if c.fit.residual is not shared}
             fitted[score.effect] = again
     return [*fitted.values()]
+
+
+def _others(
+    problem: Problem,
+    current: Fit,
+    scores: Sequence[Score],
+    best: Score,
+    fitted: Collection[int],
+    in_contact: bool,
+) -> list[Score]:
+    """Return the candidates that may do what the best contender does and are not fitted as that.
+
+    Of the names of one law, the first.
+    """
+    held = {problem.simulator.slots[j].effect for j in current.free}
+    finer = {s.effect for s in scores if any(refines(problem, s.effect, i) for i in held)}
+    scores = [s for s in scores if s.effect not in finer or s.effect not in fitted]
+    likely = {score.effect for score in likely_ones(problem, scores)}
+    like = [score for score in scores if score.effect == best.effect]
+    others: list[Score] = []
+    for score in scores:
+        is_new = score.effect in likely and score.effect not in fitted and not in_contact
+        has_simpler = score.effect in finer or bool(simpler_law(problem, score, scores))
+        is_law = score.effect in likely or not has_simpler
+        is_name = score.effect == best.effect or bool(twins(score, [*like, *others]))
+        if not is_name and (is_new or (is_law and _is_uneven(problem, score))):
+            others.append(score)
+    return others
 
 
 def _is_uneven(problem: Problem, score: Score) -> bool:
@@ -129,8 +145,8 @@ def alike_as_fitted(
             break
     same = [
         dataclasses.replace(s, start={j: float(theta[j]) for j in s.columns})
-        for s, theta, same in zip(scaled, thetas, is_same, strict=True)
-        if same
+        for s, theta, does_so in zip(scaled, thetas, is_same, strict=True)
+        if does_so
     ]
     matched = {score.effect for score in same}
     return [score for score in alike if score.effect not in matched], same

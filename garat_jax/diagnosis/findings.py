@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from garat_jax.diagnosis.units import after_number
 
 DELAYS = ("actuator_delay", "sensor_delay")
-"""Kinds that a common delay stands for: it is no nuisance to them."""
+"""Effects that come late and are no part of the mechanism. A common delay stands for them, too."""
 TIMINGS = (*DELAYS, "actuator_lag")
 """Effects that may stand for a delay where the recordings do not tell them from one."""
 MOST_NAMED = 4

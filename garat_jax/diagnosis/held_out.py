@@ -186,11 +186,7 @@ def longest_errors(
 
 
 def finer_errors(
-    problem: Problem,
-    after: Fit,
-    how: str,
-    delays: Sequence[Named] = (),
-    refinements: int = REFINEMENTS,
+    problem: Problem, after: Fit, how: str, delays: Sequence[Named] = ()
 ) -> tuple[Errors | None, Errors | None]:
     """Return the errors at a finer timestep, down to one whose own error noise hides.
 
@@ -203,23 +199,24 @@ def finer_errors(
         after: The fit of what was found, as near to a timestep of 0 as it could be taken.
         how: Names the recordings that are held out.
         delays: Those that were found.
-        refinements: How often the timestep is refined at most.
 
     Returns:
         The errors, and those as if the model had had the delays; None where the integrator's error
         would hide any other there, too.
     """
-    held_out = np.flatnonzero(~problem.fitted)
-    finer, near = at_finer_timestep(problem.take(held_out), after.take(held_out))
-    near = settle(finer, near.theta, near.start)
-    before = settle(finer, finer.simulator.base, finer.segments.start)
-    floor = noise_floor(finer, make_metric(finer), near)
-    errors = errors_of(finer, (before, near), floor, how)
-    found = errors, _errors_on_time(finer, near, delays, floor, how)
-    if errors.integrator_exceeds_noise and refinements > 1:
-        finest = finer_errors(finer, near, how, delays, refinements - 1)
-        found = finest if finest[0] else found
-    return (None, None) if errors.is_too_coarse and found[0] is errors else found
+    finest: tuple[Errors | None, Errors | None] = None, None
+    for _ in range(REFINEMENTS):
+        held_out = np.flatnonzero(~problem.fitted)
+        problem, near = at_finer_timestep(problem.take(held_out), after.take(held_out))
+        after = settle(problem, near.theta, near.start)
+        before = settle(problem, problem.simulator.base, problem.segments.start)
+        floor = noise_floor(problem, make_metric(problem), after)
+        errors = errors_of(problem, (before, after), floor, how)
+        if not errors.is_too_coarse:
+            finest = errors, _errors_on_time(problem, after, delays, floor, how)
+        if not errors.integrator_exceeds_noise:
+            break
+    return finest
 
 
 def warn_of_timestep(problem: Problem, floor: Floor, host: mujoco.MjModel) -> tuple[str, ...]:

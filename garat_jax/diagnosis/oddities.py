@@ -1,9 +1,8 @@
 """What is odd about a recording but usable: columns, units and samples that cannot well be right.
 
 Three things tell a unit. Measured velocity must be the derivative of measured position, mechanisms
-are sampled faster than twice a second, and hardly ever more than ten thousand
-times, and a motion must be one
-that the model can nearly make.
+are sampled faster than twice a second, and hardly ever more than ten thousand times, and a motion
+must be one that the model can nearly make.
 """
 
 import dataclasses
