@@ -342,7 +342,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "hidden_effects": functools.partial(hidden_effects, 16),
     "hidden_effects_outside": functools.partial(hidden_effects, 16, "outside"),
     "hidden_effects_pairs": functools.partial(hidden_effects, 14, "pair"),
-    "hidden_effects_others": functools.partial(hidden_effects_others, (15, 12, 11, 10, 9, 8, 7, 6, 5, 4)),
+    "hidden_effects_others": functools.partial(
+        hidden_effects_others, (15, 12, 11, 10, 9, 8, 7, 6, 5, 4)
+    ),
     "timing": timing,
     "real_data": real_data,
     "ground": ground,
