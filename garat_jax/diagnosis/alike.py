@@ -75,9 +75,10 @@ def _others(
     fitted: Collection[int],
     in_contact: bool,
 ) -> list[Score]:
-    """Return the candidates that may do what the best contender does and are not fitted as that.
+    """Return the candidates that may do what the best contender does, under one name each.
 
-    Of the names of one law, the first.
+    Left out are other names of the best contender's law, and what was fitted, unless few samples
+    make what it changes.
     """
     held = {problem.simulator.slots[j].effect for j in current.free}
     finer = {s.effect for s in scores if any(refines(problem, s.effect, i) for i in held)}

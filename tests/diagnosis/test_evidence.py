@@ -8,11 +8,12 @@ import pytest
 from garat_jax.diagnosis.contend import Contender, with_evidence
 from garat_jax.diagnosis.evidence import Evidence
 from garat_jax.diagnosis.fit import fit
+from garat_jax.diagnosis.metric import timestep_error
 from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.robust import wald_test
 from garat_jax.diagnosis.screen import Score
 from garat_jax.diagnosis.starts import settle
-from garat_jax.effects import ActuatorDelay, Suggestion, ViscousDamping
+from garat_jax.effects import ActuatorDelay, EncoderOffset, Suggestion, ViscousDamping
 from tests.diagnosis.test_fit import make_problem, record
 
 TIME = np.arange(500) * 0.004
@@ -75,6 +76,30 @@ def test_what_a_delay_imitates_is_no_evidence_where_a_delay_is_possible():
     is_damping, is_delay = 0, 1
     assert evidence.p_value(is_delay, delayed) < 1e-6
     assert evidence.p_value(is_damping, delayed) > 0.01
+
+
+def test_what_an_offset_of_a_sensor_imitates_is_no_evidence_but_of_what_it_is():
+    damping, offset = ViscousDamping("joint/hinge"), EncoderOffset("joint/hinge")
+    made = record(TIME)
+    problem = make_problem([dataclasses.replace(made, qpos=made.qpos + 0.02)], (damping, offset))
+    before = settle(problem, problem.simulator.base, problem.segments.start)
+    evidence = Evidence(problem, before, np.arange(len(problem.fitted)))
+    shifted = evidence.rest(
+        problem.whiten_change(np.broadcast_to([0.02, 0.0], (1, *problem.segments.measured.shape)))
+    )
+    is_damping, is_offset = 0, 1
+    assert evidence.p_value(is_offset, shifted) < 1e-6
+    assert evidence.p_value(is_damping, shifted) > 0.01
+
+
+def test_what_the_timestep_does_is_no_evidence():
+    problem = make_problem([record(TIME, noise=1e-5, finer=32)], (ViscousDamping("joint/hinge"),))
+    before = settle(problem, problem.simulator.base, problem.segments.start)
+    evidence = Evidence(problem, before, np.arange(len(problem.fitted)))
+    integrator = evidence.rest(timestep_error(problem, before)[None])
+    share = (integrator[:, 0] @ evidence.residual) ** 2 / np.sum(integrator**2)
+    assert share > 0.9 * np.sum(evidence.residual**2)
+    assert evidence.p_value(0, integrator) > 0.01
 
 
 def test_a_fit_that_changes_nothing_or_the_wrong_way_is_no_evidence():

@@ -10,10 +10,13 @@ import pytest
 from garat_jax.diagnosis.contend import Contender
 from garat_jax.diagnosis.findings import Interval
 from garat_jax.diagnosis.judge import (
+    BEHIND,
     NO_CERTAIN_GAIN,
+    NO_CERTAIN_LEAD,
     PASSING,
     TOO_FEW,
     _at_end,
+    _failed_gate,
     is_certain,
     judge,
     simplest,
@@ -180,6 +183,27 @@ def test_a_fall_is_certain_if_no_resample_rises_by_more_than_a_trifle_of_it():
     assert not is_certain(Interval(1.0, -0.1, 2.0))
     assert not is_certain(Interval(-1.0, -2.0, 0.1))
     assert not is_certain(Interval(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, ""),
+        ({"p_value": 0.02}, "not significant (corrected p = 0.02)"),
+        ({"share": 0.049}, "explains only 4.9 % of the residual"),
+        ({"gain": Interval(1.0, -0.1, 2.0)}, NO_CERTAIN_GAIN),
+        ({"lead": 0.0}, NO_CERTAIN_LEAD),
+        ({"lead": -np.inf}, BEHIND),
+        ({"stability": 0.79}, "first in only 79 % of the resamples"),
+    ],
+    ids=lambda value: " and ".join(value) or "none" if isinstance(value, dict) else None,
+)
+def test_each_gate_stops_what_passes_all_others(changes, said):
+    good = {"p_value": 1e-9, "share": 0.5, "gain": Interval(1.0, 0.5, 2.0)}
+    good |= {"lead": 0.1, "stability": 1.0}
+    score = Score(0, (0,), (0.1,), {}, 0.9, (good | changes)["p_value"], True, np.zeros(1))
+    rest = {name: value for name, value in (good | changes).items() if name != "p_value"}
+    assert _failed_gate(score, **rest) == said
 
 
 def test_a_value_that_is_a_bound_but_for_rounding_is_the_bound():

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from garat_jax.diagnosis.localise import MUCH, MissingTorque, localise, missing_torque
+from garat_jax.diagnosis.localise import MUCH, SLOW, MissingTorque, localise, missing_torque
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.dynamics import compile, initial_state, native_model, step
 from garat_jax.effects import ActuatorDelay, AsymmetricFriction, LoadFriction, QuadraticDrag
@@ -15,8 +15,22 @@ from tests import models
 TIME = np.linspace(0.0, 10.0, 2001)
 COMMAND = 2.0 * np.sin(3.1 * TIME) * np.sin(0.7 * TIME)
 CONTACT = np.maximum(np.sin(9.3 * TIME), 0.0)
-SPEED = np.cos(5.7 * TIME)
+POSITION = np.sin(5.7 * TIME) / 5.7 + 0.6 * np.sin(2.3 * TIME) / 2.3
+SPEED = np.cos(5.7 * TIME) + 0.6 * np.cos(2.3 * TIME)
+ACCELERATION = -5.7 * np.sin(5.7 * TIME) - 0.6 * 2.3 * np.sin(2.3 * TIME)
+LOAD = np.cos(1.3 * TIME)
+USUAL = np.sqrt(np.mean(SPEED**2))
+MOTION = np.tanh(SPEED / (0.05 * USUAL))
 PARTS = {
+    "against or with the motion": (MOTION, "against the motion, at any speed"),
+    "at low speed, around reversals": (
+        MOTION * (np.abs(SPEED) < SLOW * USUAL),
+        "against the motion",
+    ),
+    "in proportion to the command": (COMMAND, "of the commanded torque"),
+    "when the command changes": (np.gradient(COMMAND), "of its change in a sample"),
+    "in proportion to the load": (LOAD, "of the model's own load torque"),
+    "with position": (POSITION - POSITION.mean(), "N m/rad"),
     "in proportion to the contacts": (CONTACT, "of the model's own contact torque"),
     "when much is commanded": (
         np.sign(COMMAND) * np.maximum(np.abs(COMMAND) - MUCH * np.abs(COMMAND).max(), 0.0),
@@ -35,8 +49,7 @@ PARTS = {
 
 
 def lacking(torque, slides=False) -> MissingTorque:
-    load, rest = np.cos(1.3 * TIME), np.sin(5.7 * TIME)
-    columns = (rest / 5.7, SPEED, -5.7 * rest, COMMAND, load, CONTACT, torque)
+    columns = (POSITION, SPEED, ACCELERATION, COMMAND, LOAD, CONTACT, torque)
     nothing = np.zeros((len(TIME), 0))
     of_dofs = (c[:, None] for c in columns)
     return MissingTorque(
@@ -66,7 +79,7 @@ def test_a_hidden_regime_comes_first_with_its_size(regime):
             "0.2 N s²/m², with the motion",
         ),
         (np.full(len(TIME), 0.4), "+0.4 N m whatever", "+0.4 N whatever"),
-        (-1.5 * -5.7 * np.sin(5.7 * TIME), "1.5 kg m², against", "1.5 kg, against"),
+        (-1.5 * ACCELERATION, "1.5 kg m², against", "1.5 kg, against"),
     ],
 )
 def test_sizes_have_the_units_of_the_joint(torque, at_hinge, at_slide):

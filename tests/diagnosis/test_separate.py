@@ -6,7 +6,8 @@ import mujoco
 import pytest
 
 from garat_jax.diagnosis.findings import Named
-from garat_jax.diagnosis.separate import next_experiment
+from garat_jax.diagnosis.separate import EXPERIMENTS, next_experiment
+from garat_jax.effects import CATALOGUE
 from tests import models
 from tests.diagnosis.test_diagnosis_report import FRICTION
 
@@ -22,9 +23,25 @@ def ask(first: Named, *others: Named, text: str = models.SLIDER) -> str:
     return found.how
 
 
-def test_known_pairs_have_their_experiment():
-    how = ask(Named("motor_gain", "actuator/motor"), Named("payload_mass", "body/puck"))
-    assert "known mass attached" in how
+@pytest.mark.parametrize(
+    ("one", "other", "said"),
+    [
+        ("motor_gain", "payload_mass", "known mass attached"),
+        ("viscous_damping", "quadratic_drag", "the same motion at two amplitudes"),
+        ("actuator_delay", "rotor_inertia", "a train of steps"),
+    ],
+)
+def test_known_pairs_have_their_experiment(one, other, said):
+    pair = Named(one, "here"), Named(other, "there")
+    assert said in ask(*pair)
+    assert ask(*pair) == ask(*reversed(pair))
+
+
+@pytest.mark.parametrize("kinds", EXPERIMENTS, ids=lambda kinds: " and ".join(sorted(kinds)))
+def test_every_experiment_tells_two_kinds_of_the_catalogue_apart(kinds):
+    one, other = kinds
+    assert {one, other} <= {*CATALOGUE}
+    assert ask(Named(one, "here"), Named(other, "there")) == EXPERIMENTS[kinds]
 
 
 @pytest.mark.parametrize("more", [False, True])

@@ -1,5 +1,6 @@
 """Programs are compiled for the candidates that act, and agree where these do nothing."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -10,8 +11,10 @@ import pytest
 from flax import struct
 
 from garat_jax.diagnosis.diagnose import make_candidates
+from garat_jax.diagnosis.fit import fit
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model
+from garat_jax.diagnosis.problem import Problem
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.dynamics import Override, native_model
@@ -106,6 +109,22 @@ def test_a_candidate_that_does_nothing_predicts_what_the_model_does_without_it(m
         theta[j] += HARDLY * p.scale * (-1 if theta[j] >= p.high else 1)
         beside = simulator.predict(theta[None], segments.start[None], segments)[0]
         assert np.abs(beside - alone).max() < 1e-5, (effect.kind, effect.target)
+
+
+def test_where_mjx_steps_it_predicts_and_fits_the_same(monkeypatch):
+    """As on an accelerator: there a model that names no engine is compiled for MJX."""
+    candidates = ViscousDamping("joint/hinge"), MotorGain("actuator/motor")
+    theta, compiled = np.asarray([[0.05, 0.8]]), Model.compile
+    simulator, segments = make_simulator(models.PENDULUM, candidates)
+    known = simulator.predict(theta, segments.start[None], segments)[0]
+    monkeypatch.setattr(Model, "compile", lambda *a, **kw: compiled(*a, **{"engine": "mjx"} | kw))
+    on_mjx, _ = make_simulator(models.PENDULUM, candidates)
+    found = on_mjx.predict(theta, segments.start[None], segments)[0]
+    np.testing.assert_allclose(found, known, atol=1e-6)
+    measured, all_fitted = dataclasses.replace(segments, measured=known), segments.start[:, 0] < 9
+    problem = Problem(on_mjx, measured, all_fitted, TIME[1])
+    fitted = fit(problem, on_mjx.base, segments.start, (0, 1))
+    np.testing.assert_allclose(fitted.theta, theta[0], rtol=1e-3)
 
 
 def test_beside_a_law_that_looks_what_does_not_look_shares_a_program():

@@ -110,3 +110,27 @@ def test_a_recording_without_velocities_is_diagnosed_beside_others(damped, witho
     assert sizes == {"viscous_damping": pytest.approx(DAMPING, rel=0.05)}
     listed = {"qpos.hinge", "qvel.hinge"} if without == 1 else {"qpos.hinge"}
     assert set(found.error.per_signal) == listed
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.8])
+def test_commands_that_the_model_clamps_hide_no_gain(gain):
+    """Nine in ten are beyond the range of +-3, and what they then give is the gain's, too."""
+
+    def weaken(spec):
+        spec.actuator("motor").gainprm[0] *= gain
+
+    made = [
+        record(weaken, seed, control=lambda t, *_, k=seed: 9.0 * np.sin((15.0 + k) * t))
+        for seed in (1, 2, 3)
+    ]
+    assert np.mean(np.abs(made[0].ctrl) > 3.0) > 0.7
+    found, sizes = explain(made)
+    assert found.verdict == ("adequate" if gain == 1.0 else "missing_effect")
+    assert sizes == ({} if gain == 1.0 else {"motor_gain": pytest.approx(gain, rel=0.05)})
+
+
+def test_what_the_timestep_does_to_quiet_recordings_is_no_effect():
+    """It passes every test of significance as a delay of a part of the timestep, and is none."""
+    found, sizes = explain([record(lambda spec: None, seed, noise=1e-6) for seed in (1, 2, 3)])
+    assert found.error.integrator_exceeds_noise
+    assert (found.verdict, sizes) == ("adequate", {})

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -60,12 +61,15 @@ def test_what_diverges_later_is_said_with_the_segments_that_are_left(tmp_path, c
     assert cli.main(["compare", str(model), *map(str, files), "--out", str(out)]) == 0
     printed = capsys.readouterr()
     assert "segments were shortened to 0.2 s" in printed.err
-    content = json.loads((out / "compare.json").read_text())
+    text = (out / "compare.json").read_text()
+    content = json.loads(text, parse_constant=pytest.fail)  # neither NaN nor infinity
     (warning,) = content["warnings"]
     assert "s of a measured state at a timestep of 0.01 s" in warning
     assert warning.endswith("segments were shortened to 0.2 s")
     assert f"warning: {warning}" in printed.out
-    assert warning[1:] in (out / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert warning[1:] in page
+    assert not re.search(r"\bnan\b", re.sub(r"<script>.*?</script>", "", page, flags=re.S), re.I)
 
 
 def test_an_integrator_that_errs_more_than_the_signals_move_makes_no_verdict(tmp_path):
@@ -81,6 +85,7 @@ def test_an_integrator_that_errs_more_than_the_signals_move_makes_no_verdict(tmp
     assert not compared.near_noise
     assert found.verdict == "unexplained"
     assert found.error.unexplained_share == 1.0
+    json.dumps(found.to_json(), allow_nan=False)
     assert "cannot be judged at a timestep of 0.01 s" in diagnosis_lead(found)
     assert diagnosis_lead(found).endswith("segments were shortened to 0.2 s.")
     finer = dataclasses.replace(found.error, integrator=0.1)
