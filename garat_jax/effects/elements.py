@@ -78,6 +78,12 @@ def free_name(name: str, *finders: Callable[[str], Any]) -> str:
     )
 
 
+def as_written(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, position: float) -> float:
+    """Return a joint's position [rad or m] in the unit that the spec writes it in."""
+    in_degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+    return float(np.rad2deg(position) if in_degrees else position)
+
+
 def quaternions(host: mujoco.MjModel) -> list[int]:
     """Return where in qpos the quaternions of ball and free joints start."""
     kinds = mujoco.mjtJoint

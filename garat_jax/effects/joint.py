@@ -14,7 +14,7 @@ from scipy import optimize, signal
 from garat_jax.effects.actuator import can_bias, is_limited, make_affine
 from garat_jax.effects.at_joint import at_dof, drivers, small_torque
 from garat_jax.effects.base import Effect, ModelView, Suggestion, parameter
-from garat_jax.effects.elements import element_id
+from garat_jax.effects.elements import as_written, element_id
 from garat_jax.effects.most import follow_most, median_distance
 
 BINS_PER_PERIOD = 4
@@ -189,9 +189,7 @@ class JointStiffness(Effect):
             lengths = spec.copy().compile().tendon_lengthspring
             for tendon, length in zip(spec.tendons, lengths, strict=True):
                 tendon.springlength = length  # else the compiler measures it at the new springref
-            degrees = spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
-            reference = np.rad2deg(self.reference) if degrees else self.reference
-            pull = own * joint.springref + added * float(reference)
+            pull = own * joint.springref + added * as_written(spec, joint, float(self.reference))
             joint.springref = pull / (own + added)
             joint.stiffness[0] = own + added
         return ""

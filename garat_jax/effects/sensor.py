@@ -12,9 +12,10 @@ import mujoco
 import numpy as np
 from flax import struct
 
+from garat_jax.effects.at_joint import GAINS, drivers
 from garat_jax.effects.base import Effect, parameter
 from garat_jax.effects.command import ActuatorDelay
-from garat_jax.effects.elements import quaternions
+from garat_jax.effects.elements import as_written, element_id, quaternions
 
 
 @struct.dataclass
@@ -81,6 +82,36 @@ class EncoderOffset(Effect):
         del memory
         address = host.joint(self.name).qposadr[0]
         return state._replace(qpos=state.qpos.at[address].add(self.offset))
+
+    def export(self, spec: mujoco.MjSpec) -> str:
+        """Count the joint's position from the encoder's zero, by its `ref`.
+
+        Limits, springs and key frames move along, so that they stay where they are on the machine,
+        and so does the angle that a servo takes.
+        """
+        host = spec.copy().compile()
+        index, joint = element_id(host, "joint", self.name), spec.joint(self.name)
+        driving = drivers(host, index)
+        of_joints = host.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT
+        if np.any(of_joints & (host.wrap_objid == index)):
+            return f"{super().export(spec)}: a tendon measures it"
+        if not np.isin(host.actuator_gaintype[driving], GAINS).all():
+            return f"{super().export(spec)}: a muscle measures it"
+        offset = as_written(spec, joint, float(self.offset))
+        joint.ref, joint.springref = joint.ref + offset, joint.springref + offset
+        if host.jnt_limited[index]:
+            joint.range = joint.range + offset
+        for i in driving:
+            actuator, length = spec.actuators[i], host.actuator_gear[i, 0] * float(self.offset)
+            actuator.ctrlrange, actuator.inheritrange = host.actuator_ctrlrange[i], 0.0
+            if actuator.gaintype == mujoco.mjtGain.mjGAIN_AFFINE:
+                actuator.gainprm[0] -= actuator.gainprm[1] * length
+            if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE:
+                actuator.biasprm[0] -= actuator.biasprm[1] * length
+        for key in spec.keys:
+            if len(key.qpos):
+                key.qpos[host.jnt_qposadr[index]] += float(self.offset)
+        return ""
 
 
 @struct.dataclass

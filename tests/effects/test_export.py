@@ -12,6 +12,7 @@ from garat_jax.effects import (
     ContactCompliance,
     ContactFriction,
     EncoderOffset,
+    EncoderScale,
     GravityScale,
     GravityTilt,
     JointStiffness,
@@ -66,7 +67,53 @@ def test_the_exported_model_is_the_effect(case):
     np.testing.assert_allclose(state.qvel, data.qvel, rtol=1e-4, atol=1e-5)
 
 
+SERVOS = """<actuator>
+  <position name="shoulder" joint="shoulder" kp="60" kv="2" inheritrange="1"/>
+  <general name="elbow" joint="elbow" gear="2" gaintype="affine" gainprm="1 0.4 0"
+           biastype="affine" biasprm="0 -3 -0.1"/></actuator>
+<keyframe><key name="home" qpos="0.3 -0.4"/></keyframe>"""
+
+
+@pytest.mark.parametrize("angle", ["degree", "radian"])
+def test_an_encoder_counts_from_elsewhere_and_the_machine_moves_as_before(angle):
+    """It runs into its limit and its spring on the way, and both its servos pull."""
+    mjcf = GEOMS.partition("<actuator>")[0] + SERVOS + "</mujoco>"
+    mjcf = mjcf.replace('name="elbow"', 'name="elbow" springref="20" stiffness="2"', 1)
+    mjcf = mjcf.replace('range="-170 170"', 'range="-50 50" ref="10"')
+    source = spec(mjcf)
+    if angle == "radian":
+        source = spec(source.to_xml())
+    assert source.compiler.degree == (angle == "degree")
+    model, offset = source.compile(), np.asarray([0.2, -0.3])
+    exported = source.copy()
+    for name, by in zip(("shoulder", "elbow"), offset, strict=True):
+        assert EncoderOffset(f"joint/{name}", offset=by).export(exported) == ""
+    exported.compile()
+    counted = mujoco.MjModel.from_xml_string(exported.to_xml())
+    paths = []
+    for machine in (model, counted):
+        data = mujoco.MjData(machine)
+        mujoco.mj_resetDataKeyframe(machine, data, 0)
+        data.ctrl[:] = 0.85, 0.5
+        path = []
+        for _ in range(200):
+            mujoco.mj_step(machine, data)
+            path.append(data.qpos.copy())
+        paths.append(np.asarray(path))
+    true, read = paths
+    assert true[:, 0].max() > np.deg2rad(50)
+    np.testing.assert_allclose(read, true + offset, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(counted.actuator_ctrlrange, model.actuator_ctrlrange, atol=1e-6)
+
+
 def test_what_mjcf_cannot_say_is_said():
-    line = EncoderOffset("joint/elbow", offset=0.1).export(spec(ARM))
-    assert "encoder_offset at joint/elbow" in line
-    assert "\n" not in line
+    corded = spec(ARM.replace("<actuator>", CORD))
+    for effect in (EncoderScale("joint/elbow", 1.1), EncoderOffset("joint/elbow", 0.1)):
+        line = effect.export(corded)
+        assert f"MJCF has no words for {effect.kind} at joint/elbow" in line
+        assert "\n" not in line
+    assert line.endswith("a tendon measures it")
+    assert corded.joint("elbow").ref == 0.0
+    muscle = '<muscle joint="elbow" lengthrange="0.1 1"/>'
+    strong = spec(ARM.replace('<motor name="elbow" joint="elbow" gear="2"/>', muscle))
+    assert EncoderOffset("joint/elbow", 0.1).export(strong).endswith("a muscle measures it")
