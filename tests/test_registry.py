@@ -132,6 +132,20 @@ def test_garat_prints_every_name(command, registries, capsys):
         assert all(name in printed for name in registry)
 
 
+@pytest.mark.parametrize("kind", CATALOGUE)
+def test_garat_prints_what_an_effect_is(kind, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+    assert cli.main(["effects", kind]) == 0
+    printed, cls = capsys.readouterr().out, CATALOGUE[kind]
+    assert cls.law and printed.startswith(f"{kind}: {cls.law}")
+    assert cls.identified_by and f"Identified by: {cls.identified_by}." in printed
+    for parameter in cls.parameters():
+        assert parameter.unit and parameter.source
+        (row,) = (line for line in printed.splitlines() if f"│ {parameter.name} " in line)
+        assert f"{parameter.low:g} to {parameter.high:g}" in row
+        assert parameter.unit in row and parameter.source in row
+
+
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_every_command_finds_what_it_imports_late(name):
     source = inspect.getsource(cli.COMMANDS[name])
