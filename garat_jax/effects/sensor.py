@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from garat_jax.effects.at_joint import GAINS, drivers
+from garat_jax.effects.at_joint import AT_JOINT, BIASES, GAINS
 from garat_jax.effects.base import Effect, parameter
 from garat_jax.effects.command import ActuatorDelay
 from garat_jax.effects.elements import as_written, element_id, quaternions
@@ -91,19 +91,24 @@ class EncoderOffset(Effect):
         """
         host = spec.copy().compile()
         index, joint = element_id(host, "joint", self.name), spec.joint(self.name)
-        driving = drivers(host, index)
-        of_joints = host.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT
-        if np.any(of_joints & (host.wrap_objid == index)):
+        at_joint = np.isin(host.actuator_trntype, AT_JOINT)
+        driving = np.flatnonzero(at_joint & (host.actuator_trnid[:, 0] == index))
+        at_tendons = host.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT
+        if np.any(at_tendons & (host.wrap_objid == index)):
             return f"{super().export(spec)}: a tendon measures it"
-        if not np.isin(host.actuator_gaintype[driving], GAINS).all():
-            return f"{super().export(spec)}: a muscle measures it"
+        gains, biases = host.actuator_gaintype[driving], host.actuator_biastype[driving]
+        if not (np.isin(gains, GAINS).all() and np.isin(biases, BIASES).all()):
+            return f"{super().export(spec)}: an actuator neither fixed nor affine measures it"
         offset = as_written(spec, joint, float(self.offset))
         joint.ref, joint.springref = joint.ref + offset, joint.springref + offset
         if host.jnt_limited[index]:
             joint.range = joint.range + offset
         for i in driving:
             actuator, length = spec.actuators[i], host.actuator_gear[i, 0] * float(self.offset)
-            actuator.ctrlrange, actuator.inheritrange = host.actuator_ctrlrange[i], 0.0
+            if actuator.inheritrange:
+                actuator.ctrlrange = host.actuator_ctrlrange[i]
+                actuator.actrange = host.actuator_actrange[i]
+                actuator.inheritrange = 0.0
             if actuator.gaintype == mujoco.mjtGain.mjGAIN_AFFINE:
                 actuator.gainprm[0] -= actuator.gainprm[1] * length
             if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE:

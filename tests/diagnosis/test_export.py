@@ -69,7 +69,7 @@ def simulate_card(model, steps=150):
     state = dynamics.initial_state(world, jnp.zeros(host.nq), jnp.zeros(host.nv))
     for k in range(steps):
         state = dynamics.step(world, state, jnp.asarray(ctrl_at(k, host.nu), jnp.float32))
-    return np.asarray(state.qpos)
+    return np.asarray(dynamics.sensed(world, state).qpos)
 
 
 def test_overrides_are_in_the_exported_file(tmp_path, capsys):
@@ -154,6 +154,19 @@ def push(folder, effects, mjcf=models.ARM):
     data = mujoco.MjData(plain)
     mujoco.mj_forward(plain, data)
     return data.qfrc_actuator[plain.joint("elbow").dofadr[0]], exported.unsaid
+
+
+def test_what_else_is_at_a_joint_stays_where_it_is_when_its_encoder_counts_from_elsewhere(tmp_path):
+    model = load_model(write(tmp_path))
+    effects = [
+        CATALOGUE["encoder_offset"](target="joint/elbow", offset=0.4),
+        CATALOGUE["joint_stiffness"](target="joint/elbow", stiffness=2.0, reference=0.5),
+        CATALOGUE["torque_offset"](target="joint/elbow", torque=0.3),
+    ]
+    card = load_model(save_card(tmp_path / "with.toml", model, effects))
+    exported = export_mjcf(card, tmp_path / "with.xml")
+    assert not exported.unsaid
+    np.testing.assert_allclose(simulate_plain(exported.path), simulate_card(card), atol=3e-4)
 
 
 def test_an_offset_is_whole_whatever_the_motor_lost(tmp_path):

@@ -119,6 +119,7 @@ def test_where_mjx_steps_it_predicts_and_fits_the_same(monkeypatch):
     known = simulator.predict(theta, segments.start[None], segments)[0]
     monkeypatch.setattr(Model, "compile", lambda *a, **kw: compiled(*a, **{"engine": "mjx"} | kw))
     on_mjx, _ = make_simulator(models.PENDULUM, candidates)
+    assert (simulator._alone.engine, on_mjx._alone.engine) == ("mujoco", "mjx")
     found = on_mjx.predict(theta, segments.start[None], segments)[0]
     np.testing.assert_allclose(found, known, atol=1e-6)
     measured, all_fitted = dataclasses.replace(segments, measured=known), segments.start[:, 0] < 9

@@ -114,7 +114,7 @@ def test_a_recording_without_velocities_is_diagnosed_beside_others(damped, witho
 
 @pytest.mark.parametrize("gain", [1.0, 0.8])
 def test_commands_that_the_model_clamps_hide_no_gain(gain):
-    """Nine in ten are beyond the range of +-3, and what they then give is the gain's, too."""
+    """Most are beyond the range of 3 N m either way; what they then give is the gain's, too."""
 
     def weaken(spec):
         spec.actuator("motor").gainprm[0] *= gain

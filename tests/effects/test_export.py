@@ -68,10 +68,10 @@ def test_the_exported_model_is_the_effect(case):
 
 
 SERVOS = """<actuator>
-  <position name="shoulder" joint="shoulder" kp="60" kv="2" inheritrange="1"/>
+  <intvelocity name="shoulder" joint="shoulder" kp="60" kv="2" inheritrange="1"/>
   <general name="elbow" joint="elbow" gear="2" gaintype="affine" gainprm="1 0.4 0"
            biastype="affine" biasprm="0 -3 -0.1"/></actuator>
-<keyframe><key name="home" qpos="0.3 -0.4"/></keyframe>"""
+<keyframe><key name="home" qpos="0.3 -0.4"/><key name="rest"/></keyframe>"""
 
 
 @pytest.mark.parametrize("angle", ["degree", "radian"])
@@ -94,7 +94,7 @@ def test_an_encoder_counts_from_elsewhere_and_the_machine_moves_as_before(angle)
     for machine in (model, counted):
         data = mujoco.MjData(machine)
         mujoco.mj_resetDataKeyframe(machine, data, 0)
-        data.ctrl[:] = 0.85, 0.5
+        data.ctrl[:] = 4.0, 0.5
         path = []
         for _ in range(200):
             mujoco.mj_step(machine, data)
@@ -103,7 +103,8 @@ def test_an_encoder_counts_from_elsewhere_and_the_machine_moves_as_before(angle)
     true, read = paths
     assert true[:, 0].max() > np.deg2rad(50)
     np.testing.assert_allclose(read, true + offset, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(counted.actuator_ctrlrange, model.actuator_ctrlrange, atol=1e-6)
+    np.testing.assert_allclose(counted.actuator_actrange, model.actuator_actrange, atol=1e-6)
+    np.testing.assert_allclose(counted.key_qpos, model.key_qpos + offset, atol=1e-6)
 
 
 def test_what_mjcf_cannot_say_is_said():
@@ -116,4 +117,4 @@ def test_what_mjcf_cannot_say_is_said():
     assert corded.joint("elbow").ref == 0.0
     muscle = '<muscle joint="elbow" lengthrange="0.1 1"/>'
     strong = spec(ARM.replace('<motor name="elbow" joint="elbow" gear="2"/>', muscle))
-    assert EncoderOffset("joint/elbow", 0.1).export(strong).endswith("a muscle measures it")
+    assert EncoderOffset("joint/elbow", 0.1).export(strong).endswith("nor affine measures it")
