@@ -216,7 +216,7 @@ def size(
         suggest((effect,), host, recordings, world),
     )
     metric = make_metric(dataclasses.replace(problem, fitted=~problem.fitted))
-    before = settle(problem, simulator.base, segments.start)
+    before = settle(problem, simulator.base)
     say(f"fitting {effect.kind} at {effect.target}")
     starts = _starts(problem, before, effect, given)
     seen = _seen(problem, before, starts, free)

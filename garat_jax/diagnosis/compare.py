@@ -283,7 +283,7 @@ def _errors(played: Replay, simulator: Simulator, grid: Grid) -> Errors:
     nothing = np.zeros(len(segments.start), bool)
     problem = Problem(simulator, segments, nothing, grid.sample)
     metric = make_metric(problem)
-    floor = noise_floor(problem, metric, settle(problem, simulator.base, segments.start))
+    floor = noise_floor(problem, metric, settle(problem, simulator.base))
     by_noise = dict(zip(played.sizes(), floor.rms.tolist(), strict=True))
     per_signal = {name: _signal(size, by_noise[name]) for name, size in played.sizes().items()}
     return Errors.above(

@@ -30,6 +30,7 @@ from garat_jax.diagnosis.results import Diagnosis
 from garat_jax.diagnosis.segments import Segments, grid_for
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.slots import Slot
+from garat_jax.diagnosis.starts import as_measured
 from garat_jax.diagnosis.timestep import count_timestep
 from garat_jax.diagnosis.view import as_effects, repaired
 from garat_jax.dynamics import native_model
@@ -244,7 +245,7 @@ def _fit_together(
     _, segments = choose_horizon(joint, everything, grid)
     fitted = np.ones(len(segments.start), bool)
     problem = Problem(joint, segments, fitted, grid.sample)
-    start = segments.start
+    start, _ = as_measured(problem, joint.base)
     if longer := cut_longer(problem, everything, grid, joint.base):
         problem, start = longer[0], longer[1].start
     candidates = [c for d in diagnoses for c in d.selected]

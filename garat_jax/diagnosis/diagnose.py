@@ -103,7 +103,7 @@ def diagnose_keeping(
     seen = segments.recording < len(fitted)
     problem = Problem(simulator, segments, seen, grid.sample, suggested)
     say("the model as it is")
-    settled = settle(problem, simulator.base, segments.start)
+    settled = settle(problem, simulator.base)
     problem = trusted(problem, settled)
     outcome = explain(problem, everything, grid, settled.start, say)
     problem = outcome.problem

@@ -176,10 +176,10 @@ def longest_errors(
     longer = cut_longest(problem, recordings, grid, theta)
     if longer is None:
         return None
-    after = settle(longer, theta, longer.segments.start)
+    after = settle(longer, theta)
     longer = trusted(longer, after)
     after = settle(longer, theta, after.start)
-    before = settle(longer, longer.simulator.base, longer.segments.start)
+    before = settle(longer, longer.simulator.base)
     floor = noise_floor(longer, make_metric(longer), after)
     errors = errors_of(longer, (before, after), floor, how, signals_mostly_above)
     return None if errors.is_too_coarse else errors
@@ -209,7 +209,7 @@ def finer_errors(
         held_out = np.flatnonzero(~problem.fitted)
         problem, near = at_finer_timestep(problem.take(held_out), after.take(held_out))
         after = settle(problem, near.theta, near.start)
-        before = settle(problem, problem.simulator.base, problem.segments.start)
+        before = settle(problem, problem.simulator.base)
         floor = noise_floor(problem, make_metric(problem), after)
         errors = errors_of(problem, (before, after), floor, how)
         if not errors.is_too_coarse:

@@ -1,13 +1,14 @@
 """How long a segment may last: as long as the model can be followed."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from garat_jax.diagnosis.measurements import Recording, longest_span
 from garat_jax.diagnosis.problem import FEWEST_SEGMENTS, AnyProblem, Predictor, Problem
 from garat_jax.diagnosis.segments import QUIET, Grid, Segments, cut
+from garat_jax.diagnosis.sensing import as_they_are
 from garat_jax.diagnosis.starts import Fit, settle
 from garat_jax.errors import UserError
 
@@ -88,10 +89,12 @@ def warn_of_divergence(
     """
     longest = _possible(recordings)[0]
     segments = cut(recordings, grid, longest)
-    predicted, halved = (
-        s.predict(s.base[None], segments.start[None], segments)[0]
-        for s in (simulator, simulator.refined(2))
+
+    base, finer = simulator.base[None], simulator.refined(2)
+    start, (predicted,) = _from_measured(
+        lambda start: simulator.predict(base, start[None], segments), segments
     )
+    (halved,) = finer.predict(finer.base[None], start[None], segments)
     diverges, samples = _gone(predicted, halved, segments)
     if not np.any(diverges):
         return ()
@@ -155,7 +158,7 @@ def cut_longer(
     for longer, _ in _predictable(problem, recordings, grid, theta, everything):
         if longer.num_fitted < FEWEST_SEGMENTS:
             continue
-        settled = settle(longer, theta, longer.segments.start)
+        settled = settle(longer, theta)
         error = _error(longer.unwhiten(settled.residual), longer.segments)
         if _is_within(error.max(axis=1)):
             return longer, settled
@@ -174,7 +177,7 @@ def cut_ever_longer(
     """
     everything = np.arange(len(recordings))
     for longer, _ in [*_predictable(problem, recordings, grid, theta, everything)][::-1]:
-        yield longer, settle(longer, theta, longer.segments.start)
+        yield longer, settle(longer, theta)
 
 
 def cut_longest(
@@ -235,8 +238,27 @@ def _perturbed(simulator: Predictor, theta: np.ndarray, segments: Segments) -> n
     """Predict from the measured initial states, and from those moved by each of `PERTURBATIONS`."""
     unit = np.diag(segments.start_unit)
     steps = [np.zeros((1, len(unit))), *(size * unit for size in PERTURBATIONS)]
-    starts = segments.start + np.concatenate(steps)[:, None]
-    return simulator.predict(np.tile(theta, (len(starts), 1)), starts, segments)
+    thetas = np.tile(theta, (sum(map(len, steps)), 1))
+
+    def predict(start: np.ndarray) -> np.ndarray:
+        return simulator.predict(thetas, start + np.concatenate(steps)[:, None], segments)
+
+    return _from_measured(predict, segments)[1]
+
+
+def _from_measured(
+    predict: Callable[[np.ndarray], np.ndarray], segments: Segments
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the initial states of which sensors report what was measured, and predictions there.
+
+    Args:
+        predict: Returns predictions [P, S, L, num_signals], the first of which are from the initial
+            states [S, nq + nv] that it is given.
+        segments: The measurements.
+    """
+    predicted, unit = predict(segments.start), segments.start_unit
+    start = as_they_are(segments.start, predicted[0, :, 0], lambda s: predict(s)[0, :, 0], unit)
+    return start, predicted if start is segments.start else predict(start)
 
 
 def _growth(predicted: np.ndarray, segments: Segments) -> np.ndarray:

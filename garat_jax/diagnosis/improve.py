@@ -202,8 +202,7 @@ def _ladder(
         problem, _ = longer
     seen, segments, metric = problem.fitted, problem.segments, make_metric(problem)
     fits = [
-        settle(problem, found_theta(simulator, added[:count]), segments.start)
-        for count in range(len(added) + 1)
+        settle(problem, found_theta(simulator, added[:count])) for count in range(len(added) + 1)
     ]
     rungs = tuple(
         Rung(candidate, metric.error(f.residual, seen), metric.error(f.residual, ~seen))

@@ -19,8 +19,9 @@ from scipy import signal
 from garat_jax.diagnosis.activation import LONGEST, follow_commands, forgets_in, known_spans
 from garat_jax.diagnosis.columns import signals, torques
 from garat_jax.diagnosis.filters import even_steps, held, interpolated
+from garat_jax.diagnosis.sensing import DISPLACED, as_they_are
 from garat_jax.diagnosis.tables import FEWEST_SAMPLES
-from garat_jax.dynamics import Dynamics, apply_effects, initial_state, view
+from garat_jax.dynamics import Dynamics, apply_effects, initial_state, sensed, view
 from garat_jax.effects.elements import DOFS_OF_JOINT, element_names
 from garat_jax.effects.gear import gear_of
 from garat_jax.effects.units import at_slide
@@ -108,6 +109,7 @@ def missing_torque(
         recordings: What was measured.
         world: The same with its effects, whose commands and forces count as the model's.
     """
+    recordings = [_as_it_was(world, recording) for recording in recordings]
     activations = [_activations(model, recording) for recording in recordings]
     parts = [
         _of_span(model, r, act, slice(*span), world)
@@ -119,6 +121,27 @@ def missing_torque(
     slides = tuple(signal.unit == "m/s" for signal in signals(model)[model.nq :])
     dofs = tuple(torque.name.removeprefix("torque.") for torque in torques(model))
     return MissingTorque(dofs, actuators, slides, *stacked)
+
+
+def _as_it_was(world: Dynamics | None, recording: "Recording") -> "Recording":
+    """Return a recording with the positions and velocities that sensors reported as measured."""
+    sensors = tuple(e for e in world.effects if e.senses and not e.notes) if world else ()
+    if world is None or not sensors:
+        return recording
+    reporting, nq = world.replace(effects=sensors), recording.qpos.shape[1]
+
+    def report_one(state):
+        seen = sensed(reporting, initial_state(reporting, state[:nq], state[nq:]))
+        return jnp.concatenate([seen.qpos, seen.qvel])
+
+    def report(states: np.ndarray) -> np.ndarray:
+        with jax.enable_x64(True):
+            return np.asarray(jax.vmap(report_one)(jnp.asarray(states)))
+
+    measured = np.concatenate([recording.qpos, recording.qvel], axis=1)
+    unit = np.maximum(measured.std(axis=0), DISPLACED)
+    states = as_they_are(measured, report(measured), report, unit)
+    return dataclasses.replace(recording, qpos=states[:, :nq], qvel=states[:, nq:])
 
 
 def _known(recording: "Recording", seconds: float) -> Sequence[tuple[int, int]]:

@@ -19,9 +19,10 @@ import plotly.graph_objects as go
 from garat_jax.diagnosis.convert import write_csv
 from garat_jax.diagnosis.measurements import Recording
 from garat_jax.diagnosis.model_card import Model, check_model
-from garat_jax.diagnosis.problem import Problem, StartSpace, linearise
+from garat_jax.diagnosis.problem import Problem, StartSpace
 from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
+from garat_jax.diagnosis.starts import as_measured
 from garat_jax.dynamics import native_model
 from garat_jax.effects import are_exclusive
 from garat_jax.effects.catalogue import choose_kind
@@ -310,8 +311,8 @@ class _Judge:
         segments = cut([self._recording(path, ctrl)], self._grid, HORIZON)
         everywhere = np.ones(len(segments.start), bool)
         problem = Problem(simulator, segments, everywhere, 1.0 / RATE)
-        lin = linearise(problem, simulator.base, segments.start, (), ())
-        changes = self._changes(problem, segments.start, lin.residual)
+        start, lin = as_measured(problem, simulator.base)
+        changes = self._changes(problem, start, lin.residual)
         first, second = StartSpace(lin.start).remove(changes).reshape(-1, 2).T
         sizes = np.linalg.norm(first), np.linalg.norm(second)
         if min(sizes) <= VISIBLE * max(sizes):

@@ -152,7 +152,7 @@ def _alone(
         for j, (candidate, name) in sized_columns(simulator, selected).items()
     }
     longer = cut_longer(whole, everything, grid, theta)
-    whole, settled = longer or (whole, settle(whole, theta, segments.start))
+    whole, settled = longer or (whole, settle(whole, theta))
     sightings: dict[_Parameter, list[Sighting]] = {parameter: [] for parameter in free.values()}
     for index, recording in enumerate(everything):
         say(f"fitting {recording.name} alone")

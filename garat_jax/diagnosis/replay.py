@@ -149,7 +149,7 @@ def replay_with(
     segments = segments.take(np.isin(segments.recording, shown))
     everywhere = np.ones(len(segments.start), bool)
     problem = Problem(simulator, segments, everywhere, grid.sample)
-    settled = settle(problem, simulator.base, segments.start)
+    settled = settle(problem, simulator.base)
     residual = settled.residual.reshape(segments.measured.shape)
     of_state = signals(simulator.host)[: segments.measured.shape[2]]
     played = Replay(

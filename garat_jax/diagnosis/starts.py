@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 from garat_jax.diagnosis.problem import LARGE, Linearisation, Problem, linearise
+from garat_jax.diagnosis.sensing import as_they_are, displacement
 
 SETTLED = 1e-3
 """Fall of a segment's cost, relative to it, below which its initial state is left as it is."""
@@ -61,17 +62,41 @@ class Fit:
         return np.sum(self.residual**2, axis=1)
 
 
-def settle(problem: Problem, theta: np.ndarray, start: np.ndarray, iterations: int = 8) -> Fit:
+def settle(
+    problem: Problem, theta: np.ndarray, start: np.ndarray | None = None, iterations: int = 8
+) -> Fit:
     """Estimate the initial state of every segment at fixed parameters.
 
     Each segment has a damping of its own and is done when its linearisation promises no fall of
     its cost that matters; a step that was rejected is tried again, shorter.
+
+    Args:
+        problem: What is fitted.
+        theta: All parameters, [num_parameters].
+        start: Where to begin, [S, nq + nv]; None: where the sensors report what was measured.
+        iterations: Steps at most.
     """
-    lin = linearise(problem, theta, start, (), ())
+    if start is None:
+        start, lin = as_measured(problem, theta)
+    else:
+        lin = linearise(problem, theta, start, (), ())
     start, lin = settle_starts(problem, theta, start, lin, iterations)
     start, lin = settle_anew(problem, theta, start, lin)
     nothing = np.zeros(0)
     return Fit(theta, (), (), start, lin.residual, lin.start, nothing, nothing)
+
+
+def as_measured(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, Linearisation]:
+    """Return initial states whose sensors report what was measured, and the linearisation there."""
+    segments = problem.segments
+    lin = linearise(problem, theta, segments.start, (), ())
+
+    def report(start):
+        return problem.simulator.predict(theta[None], start[None], segments)[0, :, 0]
+
+    first = problem.unwhiten(lin.residual)[:, 0]
+    start = as_they_are(segments.start, first, report, segments.start_unit)
+    return start, lin if start is segments.start else linearise(problem, theta, start, (), ())
 
 
 def settle_twice(problem: Problem, found: Fit) -> Fit:
@@ -80,7 +105,7 @@ def settle_twice(problem: Problem, found: Fit) -> Fit:
     A fit has followed its initial states from one set of parameters to the next, in contact past
     places from where no small step leads on.
     """
-    fresh = settle(problem, found.theta, problem.segments.start)
+    fresh = settle(problem, found.theta)
     better = fresh.cost < found.cost
     return dataclasses.replace(
         found,
@@ -155,12 +180,15 @@ def _is_beyond_sensitivity(
 
 
 def _carried(problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Return where the preceding segments end, or what was measured, [S, nq + nv].
+    """Return where the preceding segments end, or what was measured, as it is, [S, nq + nv].
 
     Of some segments, only those present count; where one diverged, what follows was measured.
     """
-    predicted = problem.unwhiten(residual)
-    segments, carried = problem.segments, problem.segments.start.copy()
+    predicted, segments = problem.unwhiten(residual), problem.segments
+    is_told, carried = problem.scale[:, 0] > 0, segments.start.copy()
+    displaced = displacement(start, predicted[:, 0], segments.start_unit)
+    displaced = np.where(is_told, displaced, 0.0)
+    carried[:, : displaced.shape[1]] += displaced
     count = np.count_nonzero(segments.weight, axis=1)
     place = {at: i for i, at in enumerate(zip(segments.recording, segments.first, strict=True))}
     for number, signals in enumerate(predicted):
@@ -169,7 +197,7 @@ def _carried(problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.nd
         if after is not None and count[number] > 1 and not diverged:
             last, before = signals[count[number] - 1], signals[count[number] - 2]
             carried[after] = start[after]
-            carried[after, : len(last)] = 2.0 * last - before
+            carried[after, : len(last)] = 2.0 * last - before + displaced[after]
     return carried
 
 
