@@ -1,14 +1,15 @@
 """Plan an excitation, within the limits of actuators and joints, that tells two effects apart.
 
 What an effect changes in the signals, without what a free initial state can make, is a direction.
-Where two directions are parallel, no fit can tell the effects apart. Random multi-sines, step
+Where two directions are parallel, no fit can tell the effects apart. A law whose parameters act by
+themselves has a direction for each, and the space of all counts. Random multi-sines, step
 trains and chirps are tried, and the best one is varied; the angle decides, and that both
 effects show. One under which a joint of the model leaves its range is made smaller until none does.
 """
 
 import dataclasses
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from garat_jax.diagnosis.segments import choose_grid, cut
 from garat_jax.diagnosis.simulate import Simulator
 from garat_jax.diagnosis.starts import as_measured
 from garat_jax.dynamics import native_model
-from garat_jax.effects import are_exclusive
+from garat_jax.effects import Effect, are_exclusive
 from garat_jax.effects.catalogue import choose_kind
 from garat_jax.effects.elements import element_names
 from garat_jax.errors import UserError, unknown_name
@@ -246,7 +247,7 @@ class _Judge:
         still = self._recording(self._resting, np.zeros((len(time), host.nu)))
         self._grid = choose_grid([still], host.opt.timestep)  # activations are known from rest on
         self._simulator = Simulator(model, effects, self._grid)
-        self._sizes = [type(e).starts(host, e.target)[0] for e in effects]
+        self._sizes = [(i, size) for i, e in enumerate(effects) for size in _sizes(e, host)]
         self._places, self._hidden, self._outside = places, set(), set()
 
     @property
@@ -306,27 +307,44 @@ class _Judge:
         return {*names[joints[np.any(beyond > allowed, axis=0)]].tolist()}
 
     def _cosine(self, path: np.ndarray, ctrl: np.ndarray) -> float:
-        """Return the cosine of the two effects, infinite if one does not show."""
+        """Return the cosine of the two effects, infinite if one does not show.
+
+        Of parameters that act by themselves any combination may be meant: of all, the pair that is
+        most alike counts (the cosine of the smallest angle between the two spaces).
+        """
         simulator = self._simulator
         segments = cut([self._recording(path, ctrl)], self._grid, HORIZON)
         everywhere = np.ones(len(segments.start), bool)
         problem = Problem(simulator, segments, everywhere, 1.0 / RATE)
         start, lin = as_measured(problem, simulator.base)
         changes = self._changes(problem, start, lin.residual)
-        first, second = StartSpace(lin.start).remove(changes).reshape(-1, 2).T
-        sizes = np.linalg.norm(first), np.linalg.norm(second)
-        if min(sizes) <= VISIBLE * max(sizes):
-            self._hidden.add(self._places[int(np.argmin(sizes))])
+        changed = StartSpace(lin.start).remove(changes).reshape(-1, len(self._sizes))
+        owner = np.asarray([number for number, _ in self._sizes])
+        norms = np.linalg.norm(changed, axis=0)
+        most = [norms[owner == number].max() for number in range(2)]
+        if min(most) <= VISIBLE * max(most):
+            self._hidden.add(self._places[int(np.argmin(most))])
             return np.inf
-        return float(abs(first @ second) / (sizes[0] * sizes[1]))
+        shows = norms > VISIBLE * max(most)
+        first, second = (np.linalg.qr(changed[:, shows & (owner == i)])[0] for i in range(2))
+        return float(np.linalg.norm(first.T @ second, 2))
 
     def _changes(self, problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.ndarray:
-        """Return the change that each effect makes at the first size it is tried at, [S, N, 2]."""
+        """Return the change that each effect makes at each size it is tried at, [S, N, K]."""
         simulator = self._simulator
         thetas = np.tile(simulator.base, (len(self._sizes), 1))
-        for j, slot in enumerate(simulator.slots):
-            size = self._sizes[slot.effect]
-            thetas[slot.effect, j] = size.get(slot.parameter.name, simulator.base[j])
+        for theta, (number, size) in zip(thetas, self._sizes, strict=True):
+            for j, slot in enumerate(simulator.slots):
+                if slot.effect == number:
+                    theta[j] = size.get(slot.parameter.name, simulator.base[j])
         starts = np.tile(start, (len(thetas), 1, 1))
         moved = problem.whiten(simulator.predict(thetas, starts, problem.segments))
         return np.moveaxis(moved - residual, 0, -1)
+
+
+def _sizes(effect: Effect, host: mujoco.MjModel) -> list[Mapping[str, float]]:
+    """Return the size at which an effect is tried, or one of each parameter that acts by itself."""
+    first, *more = type(effect).starts(host, effect.target)
+    if more or not effect.independent:
+        return [first]
+    return [{p.name: float(getattr(effect, p.name)) + p.scale} for p in effect.parameters()]

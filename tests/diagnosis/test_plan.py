@@ -197,3 +197,12 @@ def test_a_body_that_an_effect_of_the_card_adds_is_no_place(pendulum):
     assert parse_place("com_offset", model) == Place("com_offset", "body/pole")
     with pytest.raises(UserError, match="unknown target of com_offset"):
         parse_place("com_offset@body/payload of pole", model)
+
+
+def test_what_one_of_several_parameters_does_is_not_told_apart_by_the_others(pendulum):
+    """A pitch of gravity is an encoder's offset to a pendulum, which hardly feels a roll."""
+    model = load_model(pendulum)
+    same = plan(model, "encoder_offset", "gravity_tilt", seconds=3.0)
+    assert min(same.before, same.after) > 0.95
+    other = plan(model, "torque_offset", "gravity_tilt", seconds=3.0)
+    assert other.after < 0.9
