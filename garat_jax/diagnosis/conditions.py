@@ -245,9 +245,10 @@ def _fit_together(
     _, segments = choose_horizon(joint, everything, grid)
     fitted = np.ones(len(segments.start), bool)
     problem = Problem(joint, segments, fitted, grid.sample)
-    start, _ = as_measured(problem, joint.base)
     if longer := cut_longer(problem, everything, grid, joint.base):
         problem, start = longer[0], longer[1].start
+    else:
+        start, _ = as_measured(problem, joint.base)
     candidates = [c for d in diagnoses for c in d.selected]
     free = [
         j

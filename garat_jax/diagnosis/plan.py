@@ -45,6 +45,8 @@ HALVINGS = 8
 """How often an excitation under which a joint leaves its range is halved before it is given up."""
 BEYOND = 1e-3
 """How far a joint may be beyond its range, more than at rest, relative to the range."""
+APART = 0.05
+"""Size of a direction, relative to the first, above which parameters of a law span it."""
 VISIBLE = 1e-3
 """Change of the signals, relative to the larger effect's, below which an effect does not show."""
 
@@ -247,7 +249,9 @@ class _Judge:
         still = self._recording(self._resting, np.zeros((len(time), host.nu)))
         self._grid = choose_grid([still], host.opt.timestep)  # activations are known from rest on
         self._simulator = Simulator(model, effects, self._grid)
-        self._sizes = [(i, size) for i, e in enumerate(effects) for size in _sizes(e, host)]
+        is_nested = any(e.kind in type(other).refines for e in effects for other in effects)
+        listed = [_sizes(effect, host)[: 1 if is_nested else None] for effect in effects]
+        self._sizes = [(number, size) for number, sizes in enumerate(listed) for size in sizes]
         self._places, self._hidden, self._outside = places, set(), set()
 
     @property
@@ -310,7 +314,8 @@ class _Judge:
         """Return the cosine of the two effects, infinite if one does not show.
 
         Of parameters that act by themselves any combination may be meant: of all, the pair that is
-        most alike counts (the cosine of the smallest angle between the two spaces).
+        most alike counts (the cosine of the smallest angle between the two spaces). A law that
+        refines the other one contains it, and is held against it by its first parameter.
         """
         simulator = self._simulator
         segments = cut([self._recording(path, ctrl)], self._grid, HORIZON)
@@ -326,7 +331,7 @@ class _Judge:
             self._hidden.add(self._places[int(np.argmin(most))])
             return np.inf
         shows = norms > VISIBLE * max(most)
-        first, second = (np.linalg.qr(changed[:, shows & (owner == i)])[0] for i in range(2))
+        first, second = (_space(changed[:, shows & (owner == i)]) for i in range(2))
         return float(np.linalg.norm(first.T @ second, 2))
 
     def _changes(self, problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.ndarray:
@@ -340,6 +345,12 @@ class _Judge:
         starts = np.tile(start, (len(thetas), 1, 1))
         moved = problem.whiten(simulator.predict(thetas, starts, problem.segments))
         return np.moveaxis(moved - residual, 0, -1)
+
+
+def _space(columns: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis [M, rank] of what columns [M, k] that are not zero span."""
+    basis, sizes, _ = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), full_matrices=False)
+    return basis[:, sizes > APART * sizes[0]]
 
 
 def _sizes(effect: Effect, host: mujoco.MjModel) -> list[Mapping[str, float]]:

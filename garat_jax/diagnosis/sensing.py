@@ -45,7 +45,8 @@ def as_they_are(
         return measured
     states, num = measured.copy(), first.shape[1]
     states[:, :num] += first
-    second = displacement(states, report(states), unit)
+    again = report(states)
+    second = np.where(np.isfinite(again), displacement(states, again, unit), first)
     moved = np.where(first == 0.0, 1.0, first)
     slope = 1.0 - (second - first) / moved
     states[:, :num] += (second - first) / np.where(np.abs(slope) > FLAT, slope, 1.0)

@@ -94,9 +94,16 @@ def as_measured(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, Linear
     def report(start):
         return problem.simulator.predict(theta[None], start[None], segments)[0, :, 0]
 
-    first = problem.unwhiten(lin.residual)[:, 0]
+    first = _reported(problem, segments.start, lin.residual)
     start = as_they_are(segments.start, first, report, segments.start_unit)
     return start, lin if start is segments.start else linearise(problem, theta, start, (), ())
+
+
+def _reported(problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return what sensors report of initial states, [S, num_signals]; these where it is unknown."""
+    first = residual.reshape(problem.segments.measured.shape)[:, 0]
+    is_told = (problem.scale[:, 0] > 0) & (np.abs(first) < LARGE)
+    return np.where(is_told, problem.unwhiten(residual)[:, 0], start[:, : first.shape[1]])
 
 
 def settle_twice(problem: Problem, found: Fit) -> Fit:
@@ -185,9 +192,8 @@ def _carried(problem: Problem, start: np.ndarray, residual: np.ndarray) -> np.nd
     Of some segments, only those present count; where one diverged, what follows was measured.
     """
     predicted, segments = problem.unwhiten(residual), problem.segments
-    is_told, carried = problem.scale[:, 0] > 0, segments.start.copy()
-    displaced = displacement(start, predicted[:, 0], segments.start_unit)
-    displaced = np.where(is_told, displaced, 0.0)
+    carried, reported = segments.start.copy(), _reported(problem, start, residual)
+    displaced = displacement(start, reported, segments.start_unit)
     carried[:, : displaced.shape[1]] += displaced
     count = np.count_nonzero(segments.weight, axis=1)
     place = {at: i for i, at in enumerate(zip(segments.recording, segments.first, strict=True))}

@@ -206,3 +206,8 @@ def test_what_one_of_several_parameters_does_is_not_told_apart_by_the_others(pen
     assert min(same.before, same.after) > 0.95
     other = plan(model, "torque_offset", "gravity_tilt", seconds=3.0)
     assert other.after < 0.9
+
+
+def test_a_law_that_contains_the_other_is_told_apart_by_what_else_it_has(pendulum):
+    nested = plan(load_model(pendulum), "coulomb_friction", "asymmetric_friction", seconds=3.0)
+    assert nested.after < min(nested.before, 0.9)

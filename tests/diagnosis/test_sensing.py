@@ -49,6 +49,14 @@ def test_states_are_found_exactly_from_what_is_reported_of_them_linearly():
     np.testing.assert_array_equal(unmeasured[:, 3], report(true)[:, 3])
 
 
+def test_states_that_a_report_says_nothing_of_move_by_what_is_known():
+    measured = np.asarray([[1.0, 2.0], [3.0, 4.0]])
+    found = as_they_are(measured, measured + 0.5, lambda s: np.full_like(s, np.nan), np.ones(2))
+    np.testing.assert_allclose(found, measured - 0.5)
+    nothing = as_they_are(measured, np.full_like(measured, np.nan), lambda s: s, np.ones(2))
+    assert nothing is measured
+
+
 def report_three(states):
     """Positions and velocities, the last of which nobody measured."""
     return np.asarray([1.0, 3.0, -2.0]) * states[:, :3] + np.asarray([0.0, 0.0, 5.0])
